@@ -1,27 +1,27 @@
-//! What a key means.
+//! Maps keys to actions.
 
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
-/// What a person wants.
+/// An action of the user.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Action {
-    /// Leave.
+    /// Quit.
     Quit,
-    /// Let the screen stand still, or go on.
+    /// Pause the screen, or resume it.
     Pause,
-    /// Select the signal so many further down.
+    /// Move the selection of the signal down by the given number.
     Select(isize),
-    /// Scroll the fields of the selected signal down by so many.
+    /// Scroll the fields of the selected signal down by the given number.
     Scroll(isize),
 }
 
-/// The meaning of a key, if it has one.
+/// Returns the action of a key, if it has one.
 pub fn action(key: KeyEvent) -> Option<Action> {
     if key.kind == KeyEventKind::Release {
         return None;
     }
     match key.code {
-        // A terminal in raw mode makes no signal of it.
+        // In raw mode the terminal sends no signal for Ctrl-C.
         KeyCode::Char('c') if key.modifiers.contains(KeyModifiers::CONTROL) => Some(Action::Quit),
         KeyCode::Char('q') | KeyCode::Esc => Some(Action::Quit),
         KeyCode::Char(' ') => Some(Action::Pause),
@@ -38,7 +38,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn keys_mean_what_the_screen_says() {
+    fn keys_map_to_the_actions_that_the_screen_names() {
         let press = |code| action(KeyEvent::new(code, KeyModifiers::NONE));
         assert_eq!(press(KeyCode::Char('q')), Some(Action::Quit));
         assert_eq!(press(KeyCode::Char(' ')), Some(Action::Pause));

@@ -1,15 +1,15 @@
-//! A screen on a running loop, in a process of its own that only reads.
+//! A terminal view of a running loop, in a separate process that only reads.
 //!
 //! | file | duty |
 //! |---|---|
-//! | `model` | what there is to see, without bus and terminal |
-//! | `feed` | takes every signal off the bus and makes the model of it |
-//! | `session` | finds a run, joins it, notices its end |
+//! | `model` | the content of the screen, without bus and terminal |
+//! | `feed` | reads every signal and updates the model |
+//! | `session` | finds a run, joins it, detects its end |
 //! | `screen` | draws the model |
-//! | `input` | what a key means |
-//! | `terminal` | the terminal: taken, and given back however the program ends |
+//! | `input` | maps keys to actions |
+//! | `terminal` | sets up the terminal, and restores it however the program ends |
 //!
-//! Must not be waited for by anybody, make a signal, or say anything on the bus.
+//! Must not delay a role, create a signal, or publish anything.
 
 mod feed;
 mod input;
@@ -29,11 +29,11 @@ use crate::bus::domain::DomainError;
 use crate::seat::RoleError;
 use std::io;
 
-/// Why there is nothing to watch.
+/// The reason that a run cannot be watched.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum WatchError {
-    /// The domain is none.
+    /// The directory is not a domain.
     #[error(transparent)]
     #[strum(transparent)]
     Domain(#[from] DomainError),
@@ -41,22 +41,24 @@ pub enum WatchError {
     #[error(transparent)]
     #[strum(transparent)]
     Run(#[from] RoleError),
-    /// The run did not open its signals, or its seats for readers are taken.
-    #[error("{source}; does it still wait for a role? A run has room for few watchers, and of a fleet for one")]
+    /// The run has not opened its signals, or has no free place for a reader.
+    #[error(
+        "cannot join the run: {source}; start its missing roles, or stop another watcher (a fleet admits only one)"
+    )]
     #[strum(serialize = "cannot-join")]
     Join {
-        /// The signal, and why.
+        /// The error of the signal.
         source: BusError,
     },
     /// A link failed.
     #[error(transparent)]
     #[strum(transparent)]
     Bus(#[from] BusError),
-    /// There is no terminal, or it failed.
-    #[error("no terminal to draw on: {source}; `corotate watch --once` prints one screen as text")]
+    /// The terminal is missing or failed.
+    #[error("cannot use the terminal: {source}; `corotate watch --once` prints one screen as text")]
     #[strum(serialize = "no-terminal")]
     Terminal {
-        /// The system's reason.
+        /// The error of the system.
         source: io::Error,
     },
 }

@@ -1,80 +1,80 @@
-//! What there is to see of a run: roles, errors over time, events, signals. Without bus and terminal.
+//! The content of the screen: roles, errors over time, events and signals. Without bus and terminal.
 //!
-//! Must not forget a peak: what is drawn narrower than it was seen keeps the largest value.
+//! Must not lose a peak: an entry that stands for several values keeps the largest.
 
 use crate::sample::RoleState;
 use crate::telemetry::{quantile, sorted};
 use std::collections::VecDeque;
 
-/// Values that a history keeps at the most; beyond it two become one.
+/// The largest number of entries of a history. When it is reached, each pair is merged into one.
 const HISTORY: usize = 256;
-/// Events that are kept.
+/// The largest number of events that are kept.
 const EVENTS: usize = 100;
-/// Latencies by which percentiles are told: the last ones.
+/// The number of latencies of which percentiles are computed.
 const WINDOW: usize = 4096;
-/// The time over which a tick rate is told, s.
+/// The time over which a tick rate is computed, s.
 const RATE_S: f64 = 1.0;
 
-/// Everything on the screen.
+/// The content of the screen.
 #[derive(Debug, Clone, Default)]
 pub struct Model {
     /// The scenario's name.
     pub scenario: String,
-    /// Its clock's name.
+    /// The name of the clock.
     pub clock: &'static str,
     /// The domain's directory.
     pub domain: String,
-    /// The last tick that something was seen of, and the last of the run.
+    /// The newest tick of which a sample was received.
     pub tick: u64,
     /// The last tick of the run.
     pub last_tick: u64,
     /// The period, s.
     pub tick_s: f64,
-    /// Whether the run is over, or gone.
+    /// True once the run has ended.
     pub ended: bool,
-    /// Whether the screen stands still.
+    /// True while the screen is paused.
     pub paused: bool,
     /// The roles, in the order of a tick.
     pub roles: Vec<RoleLine>,
-    /// Errors, and V where there is one.
+    /// The errors, and V if the law has one.
     pub series: Vec<Series>,
-    /// What happened, the newest last.
+    /// The events, the newest last.
     pub events: VecDeque<Event>,
-    /// Scripted faults of the scenario.
+    /// The number of injected faults of the scenario.
     pub scripted: usize,
     /// The signals.
     pub signals: Vec<SignalLine>,
-    /// The selected one.
+    /// The index of the selected signal.
     pub selected: usize,
-    /// The first field of it that is shown.
+    /// The index of the first visible field of the selected signal.
     pub scroll: usize,
 }
 
-/// One role.
+/// The line of a role.
 #[derive(Debug, Clone)]
 pub struct RoleLine {
-    /// Its name.
+    /// The name.
     pub name: String,
-    /// Where it stands.
+    /// The state.
     pub state: RoleState,
-    /// Its life, from 1; 0 before it has spoken.
+    /// The generation, from 1; 0 before the first heartbeat.
     pub generation: u64,
     /// The next tick that it will execute.
     pub tick: u64,
-    /// Ticks missed.
+    /// The number of missed ticks.
     pub missed: u64,
-    /// Privileges that it was denied.
+    /// The number of denied privileges.
     pub denied: u64,
-    /// Ticks executed over time.
+    /// The tick rate.
     pub rate: Rate,
-    /// From when its tick was due until its sample was sent.
+    /// Times from the due time of a tick until its sample was sent.
     pub lateness: Window,
-    /// From when its input was sent until its own sample was.
+    /// Times from the sending of an input until the output was sent.
     pub step: Window,
 }
 
 impl RoleLine {
-    /// A role that nothing is known of.
+    /// Returns the line of a role that has not reported yet.
     pub fn new(name: &str) -> Self {
         Self {
             name: name.to_owned(),
@@ -90,16 +90,16 @@ impl RoleLine {
     }
 }
 
-/// How fast a count grows.
+/// The rate of a counter.
 #[derive(Debug, Clone, Default)]
 pub struct Rate {
     seen: VecDeque<(f64, u64)>,
 }
 
 impl Rate {
-    /// Takes a count at a time, s.
+    /// Adds a count at a time, s.
     pub fn push(&mut self, time_s: f64, count: u64) {
-        // A successor of another kind may begin anew: what fell is no rate.
+        // The counter of another implementation may restart at zero.
         if self.seen.back().is_some_and(|(_, last)| count < *last) {
             self.seen.clear();
         }
@@ -109,21 +109,21 @@ impl Rate {
         }
     }
 
-    /// Per second; none before two counts are far enough apart.
+    /// Returns the rate per second; `None` until the counts span 0.1 s.
     pub fn per_s(&self) -> Option<f64> {
         let ((from_s, from), (to_s, to)) = (self.seen.front()?, self.seen.back()?);
         (to_s - from_s > 0.1).then(|| (to - from) as f64 / (to_s - from_s))
     }
 }
 
-/// The last latencies of one kind, ns; negative ones too: then the stamps are not of one clock.
+/// The most recent latencies of one kind, ns. Negative ones mean that the stamps have different clocks.
 #[derive(Debug, Clone, Default)]
 pub struct Window {
     values: VecDeque<i64>,
 }
 
 impl Window {
-    /// Takes the one between two stamps.
+    /// Adds the latency between two stamps.
     pub fn push(&mut self, from_ns: u64, to_ns: u64) {
         if self.values.len() == WINDOW {
             self.values.pop_front();
@@ -131,36 +131,36 @@ impl Window {
         self.values.push_back(to_ns.wrapping_sub(from_ns) as i64);
     }
 
-    /// The most by which the stamp that should be the earlier one lies ahead, µs; none if it never does.
+    /// Returns the largest negative latency as a positive number, µs; `None` if no latency is negative.
     pub fn ahead_us(&self) -> Option<f64> {
         self.values.iter().min().filter(|ns| **ns < 0).map(|ns| ns.unsigned_abs() as f64 / 1e3)
     }
 
-    /// The median and what 99 % are at most, µs. Of use only where no stamp lies [ahead](Self::ahead_us).
+    /// Returns the 50 % and 99 % percentiles, µs. They are valid only if no latency is [negative](Self::ahead_us).
     pub fn percentiles_us(&self) -> Option<[f64; 2]> {
         let sorted = sorted(self.values.iter().map(|ns| *ns as f64 / 1e3));
         Some([quantile(&sorted, 0.5)?, quantile(&sorted, 0.99)?])
     }
 }
 
-/// A quantity over the time that was watched.
+/// A quantity over time.
 #[derive(Debug, Clone)]
 pub struct Series {
-    /// Its name; the unit is its last part.
+    /// The name, with the unit as its suffix.
     pub name: String,
     /// The last value; NaN before the first.
     pub last: f64,
-    /// All of them.
+    /// All values.
     pub history: History,
 }
 
 impl Series {
-    /// One without values.
+    /// Returns a series without values.
     pub fn new(name: &str) -> Self {
         Self { name: name.to_owned(), last: f64::NAN, history: History::default() }
     }
 
-    /// Takes a value; one that is no number is none.
+    /// Adds a value; ignores NaN.
     pub fn push(&mut self, value: f64) {
         if !value.is_nan() {
             self.last = value;
@@ -169,12 +169,13 @@ impl Series {
     }
 }
 
-/// Values over time in bounded memory: the longer it lasts, the more values one entry stands for, by their largest.
+/// Values over time in bounded memory. An entry is the largest of several values; the number per entry grows with time.
 #[derive(Debug, Clone)]
 pub struct History {
     values: Vec<f64>,
-    /// Values per entry, and those in the last one.
+    /// The number of values per entry.
     per_entry: u64,
+    /// The number of values in the last entry.
     in_last: u64,
 }
 
@@ -202,13 +203,13 @@ impl History {
         self.in_last = 1;
     }
 
-    /// The largest values in so many stretches of equal length, the last one now; fewer if there are fewer.
-    pub fn stretches(&self, count: usize) -> Vec<f64> {
+    /// Returns the largest value in each of at most `count` intervals of equal length.
+    pub fn maxima(&self, count: usize) -> Vec<f64> {
         let per = self.values.len().div_ceil(count.max(1)).max(1);
         self.values.chunks(per).map(|values| values.iter().copied().fold(f64::NEG_INFINITY, f64::max)).collect()
     }
 
-    /// The decades that hold all values: exponents of ten, at least one apart; none without a positive value.
+    /// Returns the exponents of the decades that contain all positive values; `None` without a positive value.
     pub fn decades(&self) -> Option<(i32, i32)> {
         let positive = || self.values.iter().copied().filter(|value| *value > 0.0 && value.is_finite());
         let (low, high) = (positive().fold(f64::INFINITY, f64::min), positive().fold(0.0, f64::max));
@@ -220,44 +221,44 @@ impl History {
     }
 }
 
-/// Something that happened.
+/// An event.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Event {
-    /// At which tick it was seen.
+    /// The tick at which it was detected.
     pub tick: u64,
-    /// What.
+    /// The description.
     pub text: String,
 }
 
 impl Model {
-    /// Takes an event.
-    pub fn happened(&mut self, tick: u64, text: String) {
+    /// Adds an event; drops the oldest one if there are too many.
+    pub fn add_event(&mut self, tick: u64, text: String) {
         if self.events.len() == EVENTS {
             self.events.pop_front();
         }
         self.events.push_back(Event { tick, text });
     }
 
-    /// Selects the signal so many after this one.
+    /// Moves the selection by the given number of signals, and wraps around.
     pub fn select(&mut self, by: isize) {
         let count = self.signals.len().max(1) as isize;
         self.selected = (self.selected as isize + by).rem_euclid(count) as usize;
         self.scroll = 0;
     }
 
-    /// Scrolls through the fields of the selected signal.
+    /// Scrolls the fields of the selected signal by the given number.
     pub fn scroll(&mut self, by: isize) {
         let fields = self.signals.get(self.selected).map_or(0, |signal| signal.fields.len());
         self.scroll = self.scroll.saturating_add_signed(by).min(fields.saturating_sub(1));
     }
 }
 
-/// One signal, with its fields as text.
+/// A signal with its fields as text.
 #[derive(Debug, Clone, Default)]
 pub struct SignalLine {
     /// `body/signal`.
     pub name: String,
-    /// Name and value of every field of the last sample; empty before the first.
+    /// The name and value of every field of the newest sample; empty before the first.
     pub fields: Vec<(String, String)>,
 }
 
@@ -272,16 +273,16 @@ mod tests {
             history.push(if index == 54_321 { 7.0 } else { 1e-9 });
         }
         assert!(history.values.len() <= HISTORY);
-        let stretches = history.stretches(40);
-        assert!(stretches.len() <= 40 && stretches.len() > 20, "{}", stretches.len());
-        let peak = stretches.iter().position(|value| *value == 7.0).unwrap() as f64;
-        assert!((peak / stretches.len() as f64 - 0.543).abs() < 0.05, "it stays where it was");
-        assert_eq!(stretches.iter().filter(|value| **value == 7.0).count(), 1);
+        let maxima = history.maxima(40);
+        assert!(maxima.len() <= 40 && maxima.len() > 20, "{}", maxima.len());
+        let peak = maxima.iter().position(|value| *value == 7.0).unwrap() as f64;
+        assert!((peak / maxima.len() as f64 - 0.543).abs() < 0.05, "the peak keeps its position");
+        assert_eq!(maxima.iter().filter(|value| **value == 7.0).count(), 1);
         assert_eq!(history.decades(), Some((-9, 1)));
     }
 
     #[test]
-    fn decades_hold_what_there_is() {
+    fn decades_contain_all_positive_values() {
         let mut series = Series::new("x_s");
         assert_eq!(series.history.decades(), None);
         for value in [0.0, f64::NAN, f64::INFINITY, 0.02] {
@@ -289,7 +290,7 @@ mod tests {
         }
         assert_eq!((series.history.decades(), series.last), (Some((-2, -1)), 0.02));
         series.push(f64::NAN);
-        assert_eq!(series.last, 0.02, "no number is no value");
+        assert_eq!(series.last, 0.02, "NaN is ignored");
     }
 
     #[test]
@@ -299,10 +300,10 @@ mod tests {
         (1..=100).for_each(|us| window.push(0, us * 1000));
         assert_eq!(window.percentiles_us(), Some([50.0, 99.0]));
         (0..WINDOW).for_each(|_| window.push(0, 3000));
-        assert_eq!(window.percentiles_us(), Some([3.0, 3.0]), "the old ones are gone");
+        assert_eq!(window.percentiles_us(), Some([3.0, 3.0]), "old values are dropped");
         assert_eq!(window.ahead_us(), None);
         window.push(1_000_500, 500);
-        assert_eq!(window.ahead_us(), Some(1000.0), "the sender's clock is another");
+        assert_eq!(window.ahead_us(), Some(1000.0), "the sender has another clock");
     }
 
     #[test]
@@ -313,11 +314,11 @@ mod tests {
         (1..=300).for_each(|k| rate.push(f64::from(k) * 0.01, if k < 100 { 0 } else { 10 * (k as u64 - 100) }));
         assert!((rate.per_s().unwrap() - 1000.0).abs() < 1e-6);
         rate.push(3.01, 5);
-        assert!(rate.per_s().is_none(), "a count that fell begins anew");
+        assert!(rate.per_s().is_none(), "a smaller count restarts the rate");
     }
 
     #[test]
-    fn selecting_goes_round() {
+    fn the_selection_wraps_around() {
         let mut model = Model::default();
         model.select(1);
         assert_eq!(model.selected, 0, "there is nothing to select");

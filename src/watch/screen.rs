@@ -1,4 +1,4 @@
-//! Draws the model. 80 by 24 is enough; what has no room is left out from below, and said.
+//! Draws the model. 80 by 24 cells suffice; the screen states how many roles it omits.
 
 use super::model::{Model, RoleLine, Series};
 use crate::sample::RoleState;
@@ -9,43 +9,43 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Borders, Paragraph, Sparkline, SparklineBar};
 use ratatui::{Frame, Terminal};
 
-/// Below this nothing can be read.
+/// The smallest screen that is drawn.
 const MIN_WIDTH: u16 = 60;
 const MIN_HEIGHT: u16 = 12;
-/// The height for which everything is laid out; higher screens show more roles and events.
+/// The height of the standard layout; taller screens show more roles and events.
 const USUAL_HEIGHT: u16 = 24;
-/// Lines for roles on a screen of the usual height, and the least number of lines for events and fields.
+/// The lines for roles on a screen of the usual height, and the smallest numbers of lines for events and fields.
 const ROLES: u16 = 8;
 const EVENTS_MIN: u16 = 3;
 const FIELDS_MIN: u16 = 5;
-/// Columns of names and values beside a sparkline, of its scale, and of a field's name.
+/// The columns for names and values beside a sparkline, for its scale, and for the name of a field.
 const NAME_WIDTH: u16 = 24;
 const SCALE_WIDTH: u16 = 6;
 const FIELD_WIDTH: usize = 26;
-/// Steps of a sparkline, more than any screen resolves.
+/// The resolution of a sparkline, finer than any screen.
 const STEPS: f64 = 1000.0;
 
 const DIM: Style = Style::new().add_modifier(Modifier::DIM);
 const BOLD: Style = Style::new().add_modifier(Modifier::BOLD);
 const ALARM: Style = Style::new().fg(Color::Red).add_modifier(Modifier::BOLD);
 
-/// Draws everything.
+/// Draws the model on a frame.
 pub fn draw(model: &Model, frame: &mut Frame<'_>) {
     let area = frame.area();
     if area.width < MIN_WIDTH || area.height < MIN_HEIGHT {
-        let text = format!("{MIN_WIDTH} x {MIN_HEIGHT} is the least; 80 x 24 shows all. q quits");
+        let text = format!("Enlarge the terminal to {MIN_WIDTH} x {MIN_HEIGHT}, better 80 x 24. q: quit");
         frame.render_widget(Paragraph::new(text), area);
         return;
     }
     let roles = (model.roles.len() as u16).min(ROLES + area.height.saturating_sub(USUAL_HEIGHT) / 2);
-    // Two lines per sparkline where there is room.
+    // A sparkline has two lines if they fit.
     let fixed = 1 + (1 + roles) + 1 + (1 + EVENTS_MIN) + (1 + FIELDS_MIN) + 1;
     let series = model.series.len() as u16;
     let lines = if area.height >= fixed + 2 * series { 2 } else { 1 };
-    // All fields of the selected signal where there is room; events have the rest.
-    let others = 1 + (1 + roles) + (1 + lines * series) + 1;
+    // Events get the lines that the fields of the selected signal do not need.
+    let fixed = 1 + (1 + roles) + (1 + lines * series) + 1;
     let fields = model.signals.get(model.selected).map_or(0, |signal| signal.fields.len() as u16).max(FIELDS_MIN);
-    let events = area.height.saturating_sub(others + 1 + fields).max(1 + EVENTS_MIN);
+    let events = area.height.saturating_sub(fixed + 1 + fields).max(1 + EVENTS_MIN);
     let [head, role_area, series_area, event_area, signal_area, foot] = Layout::vertical([
         Constraint::Length(1),
         Constraint::Length(1 + roles),
@@ -57,7 +57,7 @@ pub fn draw(model: &Model, frame: &mut Frame<'_>) {
     .areas(area);
     frame.render_widget(header(model), head);
     frame.render_widget(Paragraph::new(role_lines(model, usize::from(roles))), role_area);
-    let series_area = section("errors, log scale; the largest of each stretch", series_area, frame);
+    let series_area = section("errors, log scale, largest value per column", series_area, frame);
     draw_series(model, lines, frame, series_area);
     draw_events(model, frame, event_area);
     let signal_area = section(&signal_title(model, usize::from(area.width)), signal_area, frame);
@@ -65,7 +65,7 @@ pub fn draw(model: &Model, frame: &mut Frame<'_>) {
     frame.render_widget(Line::styled("q quit  space pause  up/down/tab signal  left/right fields", DIM), foot);
 }
 
-/// The screen as text, without colours.
+/// Returns the screen as text, without colours.
 pub fn text(model: &Model, width: u16, height: u16) -> String {
     let Ok(mut terminal) = Terminal::new(TestBackend::new(width, height));
     let Ok(drawn) = terminal.draw(|frame| draw(model, frame));
@@ -73,7 +73,7 @@ pub fn text(model: &Model, width: u16, height: u16) -> String {
     rows.map(|row| row.iter().map(|cell| cell.symbol()).collect::<String>().trim_end().to_owned() + "\n").collect()
 }
 
-/// Draws a section's title and gives the room below it.
+/// Draws the title of a section and returns the area below it.
 fn section(title: &str, area: Rect, frame: &mut Frame<'_>) -> Rect {
     let block = Block::new().borders(Borders::TOP).border_style(DIM).title(format!(" {title} "));
     let inner = block.inner(area);
@@ -118,7 +118,7 @@ fn role_lines(model: &Model, room: usize) -> Vec<Line<'static>> {
 fn role_line(role: &RoleLine) -> Line<'static> {
     let state = RoleState::NAMES.into_iter().find(|(_, state)| *state == role.state).map_or("?", |(name, _)| name);
     let rate = role.rate.per_s().map_or("-".to_owned(), |rate| format!("{rate:.0}"));
-    let of = |window: &super::Window| {
+    let percentiles = |window: &super::Window| {
         let pair = |[p50, p99]: [f64; 2]| format!("{}/{}", short(p50), short(p99));
         match window.ahead_us() {
             Some(us) => format!("ahead {}", short(us)),
@@ -132,11 +132,11 @@ fn role_line(role: &RoleLine) -> Line<'static> {
         Span::styled(format!("{:>4} ", role.generation), alarmed(role.generation > 1)),
         Span::raw(format!("{:>9} {rate:>7} ", role.tick)),
         Span::styled(format!("{:>6} ", role.missed), alarmed(role.missed > 0)),
-        Span::raw(format!("{:>13} {:>13}", of(&role.lateness), of(&role.step))),
+        Span::raw(format!("{:>13} {:>13}", percentiles(&role.lateness), percentiles(&role.step))),
     ])
 }
 
-/// A number of µs in few columns.
+/// Formats a number of µs in few columns.
 fn short(us: f64) -> String {
     match us {
         us if us < 10.0 => format!("{us:.1}"),
@@ -145,7 +145,7 @@ fn short(us: f64) -> String {
     }
 }
 
-/// The beginning of a text, with a mark where it was cut.
+/// Cuts a text to a width, with `..` at the cut.
 fn cut(text: &str, width: usize) -> String {
     match text.chars().count() {
         length if length <= width => text.to_owned(),
@@ -168,15 +168,15 @@ fn draw_series(model: &Model, lines: u16, frame: &mut Frame<'_>, area: Rect) {
     }
 }
 
-/// One sparkline and the decades that it spans.
+/// Draws a sparkline and the decades that it spans.
 fn draw_line(series: &Series, frame: &mut Frame<'_>, plot: Rect, scale: Rect) {
     let Some((low, high)) = series.history.decades() else { return };
     let level = |value: f64| {
         let part = (value.log10() - f64::from(low)) / f64::from(high - low);
-        // A zero lies below every decade, and what is beyond all bounds above.
+        // Zero is drawn at the bottom, infinity at the top.
         SparklineBar::from((STEPS * part.clamp(0.0, 1.0)) as u64)
     };
-    let bars: Vec<SparklineBar> = series.history.stretches(usize::from(plot.width)).into_iter().map(level).collect();
+    let bars: Vec<SparklineBar> = series.history.maxima(usize::from(plot.width)).into_iter().map(level).collect();
     frame.render_widget(Sparkline::default().max(STEPS as u64).data(bars), plot);
     let ends =
         if scale.height > 1 { vec![format!(" 1e{high}"), format!(" 1e{low}")] } else { vec![format!(" 1e{high}")] };
@@ -186,7 +186,7 @@ fn draw_line(series: &Series, frame: &mut Frame<'_>, plot: Rect, scale: Rect) {
 fn draw_events(model: &Model, frame: &mut Frame<'_>, area: Rect) {
     let title = match model.scripted {
         0 => format!("events ({})", model.events.len()),
-        scripted => format!("events ({}); {scripted} faults are scripted", model.events.len()),
+        scripted => format!("events ({}); {scripted} injected faults in the scenario", model.events.len()),
     };
     let area = section(&title, area, frame);
     let newest = model.events.iter().rev().take(usize::from(area.height));
@@ -194,7 +194,7 @@ fn draw_events(model: &Model, frame: &mut Frame<'_>, area: Rect) {
     frame.render_widget(Paragraph::new(lines.collect::<Vec<_>>()), area);
 }
 
-/// The names of the signals, the selected one marked, as many as fit beside each other.
+/// Returns the names of as many signals as fit, with the selected one marked.
 fn signal_title(model: &Model, width: usize) -> String {
     let room = width.saturating_sub(" signals (999): ... ... ".len());
     let names: Vec<String> = model.signals.iter().map(|signal| cut(&signal.name, room)).collect();
@@ -209,7 +209,7 @@ fn signal_title(model: &Model, width: usize) -> String {
     title.trim_end().to_owned()
 }
 
-/// The fields of the selected signal, which the title names.
+/// Draws the fields of the selected signal, which the title names.
 fn draw_signals(model: &Model, frame: &mut Frame<'_>, area: Rect) {
     let Some(selected) = model.signals.get(model.selected) else { return };
     let field =
@@ -245,14 +245,14 @@ mod tests {
             tick_s: 1e-3,
             roles: vec![leader, RoleLine::new("a-follower-with-a-long-name")],
             series: vec![error, Series::new("estimate_error_rad_s")],
-            events: [Event { tick: 1200, text: "leader is back, in its life 2".to_owned() }].into(),
+            events: [Event { tick: 1200, text: "leader restarted: life 2".to_owned() }].into(),
             signals: vec![signal("leader/measurement", "+1.0000e0"), signal("leader/truth", "+2.0000e0")],
             ..Model::default()
         }
     }
 
     #[test]
-    fn everything_is_on_a_screen_of_80_by_24() {
+    fn a_screen_of_80_by_24_shows_everything() {
         let text = text(&model(), 80, 24);
         for word in [
             "corotate rigid-pair  realtime 1000 Hz  1.23 of 10.00 s  tick 1234/10000",
@@ -262,7 +262,7 @@ mod tests {
             "1.080e-10",
             "1e0",
             "1e-10",
-            "     1200  leader is back, in its life 2",
+            "     1200  leader restarted: life 2",
             " signals (2): >leader/measurement  leader/truth ─",
             " tick                       1234",
             " omega_rad_s                +1.0000e0",
@@ -274,11 +274,11 @@ mod tests {
         assert!(text.lines().all(|line| line.chars().count() <= 80));
     }
 
-    /// The values below the names of the signals are those of the marked one, and beside a value stands no signal's name.
+    /// Only the fields of the marked signal are shown, and their lines contain no signal name.
     #[test]
-    fn fields_are_those_of_the_marked_signal() {
+    fn fields_belong_to_the_marked_signal() {
         let mut model = model();
-        for (selected, value, other) in [(0, "+1.0000e0", "+2.0000e0"), (1, "+2.0000e0", "+1.0000e0")] {
+        for (selected, value, hidden) in [(0, "+1.0000e0", "+2.0000e0"), (1, "+2.0000e0", "+1.0000e0")] {
             model.selected = selected;
             let text = text(&model, 80, 24);
             assert!(text.contains(&format!(">{}", model.signals[selected].name)), "{text}");
@@ -286,13 +286,13 @@ mod tests {
                 text.lines().find(|line| line.contains("omega")),
                 Some(&*format!(" omega_rad_s                {value}"))
             );
-            assert!(!text.contains(other), "{text}");
+            assert!(!text.contains(hidden), "{text}");
         }
     }
 
-    /// A high screen shows more events, and no line between the sections is empty while there are more.
+    /// A taller screen shows more events, and leaves no empty line between the sections while there are more.
     #[test]
-    fn events_have_the_height_that_there_is() {
+    fn events_fill_the_available_height() {
         let mut model = model();
         model.events = (0..24).map(|tick| Event { tick, text: format!("event of {tick}") }).collect();
         for (height, shown) in [(24, 7), (30, 13), (40, 23), (41, 24), (50, 24)] {
@@ -303,9 +303,9 @@ mod tests {
         }
     }
 
-    /// A falling error falls on the screen: the bars get no higher from left to right.
+    /// The bars of a decreasing error do not rise from left to right.
     #[test]
-    fn the_sparkline_falls_with_the_error() {
+    fn the_sparkline_of_a_decreasing_error_decreases() {
         let text = text(&model(), 80, 24);
         let line = text.lines().find(|line| line.starts_with("sync_error_rad_s")).unwrap();
         let bars: Vec<u32> = line.chars().skip(24).take_while(|bar| *bar != ' ').map(u32::from).collect();
@@ -314,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn every_size_is_drawn_without_harm() {
+    fn every_screen_size_can_be_drawn() {
         let mut model = model();
         model.roles = (0..40).map(|index| RoleLine::new(&format!("follower-{index}"))).collect();
         model.signals =

@@ -1,9 +1,9 @@
-//! A run that is watched: found, joined, and left as soon as it ends.
+//! A session with a run: finds it, joins it, and leaves as soon as it ends.
 //!
-//! Must not outstay the run in its domain: whoever owns that removes it, and expects it to stay removed.
+//! Must not stay in the domain after the run has ended, since its owner removes the domain.
 
 use super::WatchError;
-use super::feed::{Feed, LOOK_NS};
+use super::feed::{Feed, POLL_NS};
 use super::model::Model;
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
@@ -15,21 +15,21 @@ use crate::scenario::Scenario;
 use crate::seat::{RoleError, find_run, join_complete};
 use std::path::Path;
 
-/// How much a watcher gives way to everybody.
+/// The nice value of the watcher.
 const NICENESS: i32 = 10;
-/// For so long a run may still be opening its signals, ns.
+/// The time that a run may take to open its signals, ns.
 const JOIN_NS: u64 = 10_000_000_000;
 
-/// A run that is watched.
+/// A watched run.
 pub struct Session {
     domain: Domain,
     scenario: Scenario,
     joined: Option<Joined>,
-    /// What there is to see.
+    /// The content of the screen.
     pub model: Model,
 }
 
-/// The links go before the node that they belong to.
+/// The open links; they are dropped before the bus, in the order of the fields.
 struct Joined {
     feed: Feed,
     schedule: <IoxBus as Bus>::Reader<Schedule>,
@@ -40,27 +40,27 @@ impl Joined {
     fn open(
         domain: &Domain,
         scenario: &Scenario,
-        patient: impl Fn() -> bool,
+        may_wait: impl Fn() -> bool,
         model: &mut Model,
     ) -> Result<Self, BusError> {
-        let bus = insist(&patient, || IoxBus::join(domain, "watch", depths(scenario)))?;
-        let feed = insist(&patient, || Feed::open(scenario, &bus, model))?;
+        let bus = retry(&may_wait, || IoxBus::join(domain, "watch", depths(scenario)))?;
+        let feed = retry(&may_wait, || Feed::open(scenario, &bus, model))?;
         let schedule = bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?;
         Ok(Self { feed, schedule, _bus: bus })
     }
 }
 
 impl Session {
-    /// Joins the run in that domain, or with its results in that directory, or the newest of this user. Waits for one that is
-    /// only just being started, until `stop` says so.
+    /// Joins the run with the given domain or output directory, or the newest run of this user. Waits for a run that is
+    /// starting, until `stop` returns true.
     ///
     /// # Errors
     /// [`WatchError`].
     pub fn open(directory: Option<&Path>, stop: impl Fn() -> bool) -> Result<Self, WatchError> {
         let root = find_run(directory)?;
         let end_ns = monotonic_ns() + JOIN_NS;
-        let patient = || monotonic_ns() < end_ns && !stop();
-        let (domain, scenario) = insist(patient, || join_complete(&root))?;
+        let may_wait = || monotonic_ns() < end_ns && !stop();
+        let (domain, scenario) = retry(may_wait, || join_complete(&root))?;
         let mut model = Model {
             scenario: scenario.name.clone(),
             clock: scenario.clock.name(),
@@ -70,43 +70,43 @@ impl Session {
             ..Model::default()
         };
         let joined =
-            join_at_low_priority(&scenario, NICENESS, || Joined::open(&domain, &scenario, patient, &mut model));
+            join_at_low_priority(&scenario, NICENESS, || Joined::open(&domain, &scenario, may_wait, &mut model));
         Ok(Self { joined: Some(joined.map_err(|source| WatchError::Join { source })?), domain, scenario, model })
     }
 
-    /// Takes what has come. To be called every 0.1 s or so; the model tells when the run has ended.
+    /// Reads the new samples, and sets `model.ended` when the run has ended. Must be called about every 0.1 s.
     ///
     /// # Errors
     /// [`WatchError::Bus`].
-    pub fn look(&mut self) -> Result<(), WatchError> {
+    pub fn poll(&mut self) -> Result<(), WatchError> {
         let Some(Joined { feed, schedule, .. }) = &mut self.joined else { return Ok(()) };
         while schedule.advance()? {}
-        let word = schedule.current().copied().unwrap_or_default();
-        let phase = Phase::from_number(word.phase);
-        let grid = Grid { epoch_ns: word.epoch_ns, period_ns: self.scenario.period_ns };
-        feed.look((phase >= Phase::Run).then_some(grid), &mut self.model)?;
+        let current = schedule.current().copied().unwrap_or_default();
+        let phase = Phase::from_number(current.phase);
+        let grid = Grid { epoch_ns: current.epoch_ns, period_ns: self.scenario.period_ns };
+        feed.poll((phase >= Phase::Run).then_some(grid), &mut self.model)?;
         if phase == Phase::Stop || !self.domain.exists() {
             self.leave();
         }
         Ok(())
     }
 
-    /// Brings what is only for the eye up to date.
+    /// Updates the parts of the model that only a screen needs.
     pub fn refresh(&mut self) {
         if let Some(Joined { feed, .. }) = &self.joined {
-            feed.tell(&mut self.model);
+            feed.refresh(&mut self.model);
         }
     }
 
-    /// Watches without a screen for so long, ns, or until the run ends, or `stop` says so.
+    /// Watches without a screen for the given time, ns, or until the run ends or `stop` returns true.
     ///
     /// # Errors
     /// [`WatchError::Bus`].
     pub fn follow(&mut self, ns: u64, stop: impl Fn() -> bool) -> Result<(), WatchError> {
         let end_ns = monotonic_ns().saturating_add(ns);
         while !self.model.ended && !stop() && monotonic_ns() < end_ns {
-            self.look()?;
-            sleep_until(monotonic_ns() + LOOK_NS);
+            self.poll()?;
+            sleep_until(monotonic_ns() + POLL_NS);
         }
         self.refresh();
         Ok(())
@@ -128,33 +128,34 @@ impl Drop for Session {
     }
 }
 
-/// Tries again and again: a run that was just started makes one thing after another.
-fn insist<T, E>(patient: impl Fn() -> bool, mut attempt: impl FnMut() -> Result<T, E>) -> Result<T, E>
+/// Repeats an attempt while its error may be temporary: a starting run creates its parts one after another.
+fn retry<T, E>(may_wait: impl Fn() -> bool, mut attempt: impl FnMut() -> Result<T, E>) -> Result<T, E>
 where
     E: Retry,
 {
     loop {
         match attempt() {
-            Err(error) if error.may_pass() && patient() => sleep_until(monotonic_ns() + LOOK_NS),
-            other => return other,
+            Err(error) if error.is_temporary() && may_wait() => sleep_until(monotonic_ns() + POLL_NS),
+            result => return result,
         }
     }
 }
 
-/// Whether an error may be one of a run that is only just being started.
+/// An error that a starting run may cause.
 trait Retry {
-    fn may_pass(&self) -> bool;
+    /// Returns true if a later attempt may succeed.
+    fn is_temporary(&self) -> bool;
 }
 
 impl Retry for RoleError {
-    /// A directory without a lock is no domain and will be none; one without a scenario is about to have it.
-    fn may_pass(&self) -> bool {
+    /// A domain without a scenario is about to get one. A directory without a lock never becomes a domain.
+    fn is_temporary(&self) -> bool {
         matches!(self, Self::Config(crate::config::ConfigError::Read { .. }))
     }
 }
 
 impl Retry for BusError {
-    fn may_pass(&self) -> bool {
+    fn is_temporary(&self) -> bool {
         true
     }
 }

@@ -1,9 +1,9 @@
-//! The terminal: taken, drawn on, and given back however the program ends.
+//! Sets up the terminal, draws on it, and restores it however the program ends.
 //!
-//! A panic gives it back too (ratatui's hook); a signal that asks for the end only sets a number, which is looked at here.
+//! ratatui's hook restores it after a panic. A signal handler only sets a number, which the loop here reads.
 
 use super::WatchError;
-use super::feed::LOOK_NS;
+use super::feed::POLL_NS;
 use super::input::{Action, action};
 use super::model::Model;
 use super::screen::draw;
@@ -16,17 +16,17 @@ use std::io::{self, IsTerminal};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-/// Between two pictures, ns: what a person can read, and a slow line carry.
+/// The time between two drawings, ns: a user can read them, and a slow line can carry them.
 const DRAW_NS: u64 = 200_000_000;
 
-/// Shows a run until a key or a signal says that it is enough.
+/// Shows a run until the user quits or a signal arrives.
 ///
 /// # Errors
 /// [`WatchError`].
 pub fn show(session: &mut Session, signal: &AtomicUsize) -> Result<(), WatchError> {
     let failed = |source| WatchError::Terminal { source };
     if !io::stdout().is_terminal() || !io::stdin().is_terminal() {
-        return Err(failed(io::Error::other("stdin and stdout are to be one")));
+        return Err(failed(io::Error::other("stdin and stdout are not a terminal")));
     }
     let mut terminal = ratatui::try_init().map_err(failed)?;
     let shown = watch(&mut terminal, session, signal);
@@ -38,8 +38,8 @@ fn watch(terminal: &mut DefaultTerminal, session: &mut Session, signal: &AtomicU
     let failed = |source| WatchError::Terminal { source };
     let (mut paused, mut next_draw_ns): (Option<Model>, u64) = (None, 0);
     while signal.load(Ordering::Relaxed) == 0 {
-        // Also while the screen stands still: samples are not kept waiting.
-        session.look()?;
+        // Polls while paused too, so that the queues do not fill up.
+        session.poll()?;
         let now_ns = monotonic_ns();
         if now_ns >= next_draw_ns {
             session.refresh();
@@ -47,7 +47,7 @@ fn watch(terminal: &mut DefaultTerminal, session: &mut Session, signal: &AtomicU
             terminal.draw(|frame| draw(model, frame)).map_err(failed)?;
             next_draw_ns = now_ns + DRAW_NS;
         }
-        if hung_up(LOOK_NS) {
+        if hung_up(POLL_NS) {
             return Ok(());
         }
         if !event::poll(Duration::ZERO).map_err(failed)? {
@@ -60,11 +60,11 @@ fn watch(terminal: &mut DefaultTerminal, session: &mut Session, signal: &AtomicU
         match wanted {
             Some(Action::Quit) => return Ok(()),
             Some(Action::Pause) => {
-                let still = Model { paused: true, ..session.model.clone() };
-                paused = if paused.is_some() { None } else { Some(still) };
+                let snapshot = Model { paused: true, ..session.model.clone() };
+                paused = if paused.is_some() { None } else { Some(snapshot) };
             }
-            Some(Action::Select(by)) => each(&mut paused, session, |model| model.select(by)),
-            Some(Action::Scroll(by)) => each(&mut paused, session, |model| model.scroll(by)),
+            Some(Action::Select(by)) => apply(&mut paused, session, |model| model.select(by)),
+            Some(Action::Scroll(by)) => apply(&mut paused, session, |model| model.scroll(by)),
             None => {}
         }
         next_draw_ns = 0;
@@ -72,19 +72,19 @@ fn watch(terminal: &mut DefaultTerminal, session: &mut Session, signal: &AtomicU
     Ok(())
 }
 
-/// Waits for input, at most so long, and tells whether there is nobody at the other end any more: asked for events of such a
-/// terminal, crossterm would look for them without end.
+/// Waits for input for at most the given time; returns true if the terminal has hung up. Reading events of such a terminal
+/// makes crossterm loop for ever.
 fn hung_up(wait_ns: u64) -> bool {
     let stdin = io::stdin();
     let mut terminal = [PollFd::new(&stdin, PollFlags::IN)];
     let timeout = Timespec { tv_sec: 0, tv_nsec: wait_ns as _ };
-    // Interrupted, as by a change of the window's size: the caller looks for itself.
+    // An interrupted wait, for example by a resize, needs no handling.
     let _ = poll(&mut terminal, Some(&timeout));
     terminal[0].revents().intersects(PollFlags::HUP | PollFlags::ERR | PollFlags::NVAL)
 }
 
-/// What is selected is so on the screen that stands still and on the one that goes on.
-fn each(paused: &mut Option<Model>, session: &mut Session, act: impl Fn(&mut Model)) {
-    act(&mut session.model);
-    paused.iter_mut().for_each(act);
+/// Applies a change to the live model and to the paused one.
+fn apply(paused: &mut Option<Model>, session: &mut Session, change: impl Fn(&mut Model)) {
+    change(&mut session.model);
+    paused.iter_mut().for_each(change);
 }

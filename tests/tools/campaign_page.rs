@@ -116,7 +116,7 @@ fn a_campaign_that_was_run_is_shown_as_its_table_has_it() {
     }
     assert_eq!((cases, ended), (18, invalid), "{told}");
     assert!(told.starts_with("map: 18 cases and 3 margin points; "), "{told}");
-    assert!(html.contains("the bar across the scale is the limit, 0.02"));
+    assert!(html.contains("bar across the scale marks the limit, 0.02"));
     let margins = rows(section(&page, "margins"));
     assert_eq!(margins.len(), 1 + table.margins[0].points.len());
     assert_eq!(margins[0], ["tick_hz", "holds at", "fails at", "runs"]);
@@ -141,13 +141,13 @@ fn what_has_been_run_is_shown_and_what_a_campaign_has_not_is_refused() {
     let bench = bench();
     well(bench.run(&["sweep", "./map.toml", "--out", "results", "--shard", "0/3", "-q"]));
     let html = page(&bench, &[]);
-    assert!(html.contains("12 of 18 cases have not been run, or not here"), "{html}");
+    assert!(html.contains("12 of 18 cases are missing"), "{html}");
     assert!(text(section(&parse(&html), "result")).contains("cases run6"));
     // Half a line at the end is none.
     let journal = bench.path("results/journal");
     let whole = fs::read(&journal).unwrap();
     fs::write(&journal, &whole[..whole.len() - 40]).unwrap();
-    assert!(page(&bench, &[]).contains("cases have not been run, or not here"));
+    assert!(page(&bench, &[]).contains("cases are missing"));
     for other in [&["--show", "leader/truth.omega_rad_s"][..], &["results"]] {
         let done = bench.run(&[&["report", "results"], other].concat());
         assert_eq!(done.code, Some(2), "{done:?}");

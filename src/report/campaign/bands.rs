@@ -1,8 +1,8 @@
-//! The decisive metric along one axis, as bands from quantile to quantile; which part of the cases was accepted there; and the
-//! distribution of a number over all cases.
+//! Charts along one axis: quantile bands of the decisive metric, and the percentage of accepted cases. Also the distribution
+//! of a number over all cases.
 //!
-//! Quantiles are values of cases, not between two. Lines join the values that were run; where values are drawn, they are level over a
-//! cell. Must not go on where no case is.
+//! A quantile is the value of a case, without interpolation. A line joins the values of a list or range; it is level over a
+//! cell of drawn values. Must not draw a line where there are no cases.
 
 use super::facts::{Facts, claimed_share, share};
 use super::scatter;
@@ -16,29 +16,29 @@ use crate::report::html::escape;
 use crate::telemetry::quantile;
 use std::fmt::Write;
 
-/// An axis is divided into at most so many cells, one for so many cases where its values are drawn.
+/// The largest number of cells of an axis; of an axis of drawn values, and the number of cases per cell there.
 const CELLS: usize = 64;
 const DRAWN: usize = 24;
 const EACH: usize = 25;
-/// So many cases are drawn as points over bands.
+/// The largest number of cases that are drawn as points over the bands.
 const POINTS: usize = 300;
-/// Curves have at most so many points.
+/// The largest number of points of a curve.
 const CURVE: usize = 1000;
-/// The height of a picture, and of one as wide as the page.
+/// The height of a chart, and of a page-wide chart.
 const TALL: f64 = 300.0;
 const WIDE_TALL: f64 = 420.0;
-/// Room above a picture for what it shows, and for the key of its points.
+/// The height of the heading and the key of the points above a chart.
 const ABOVE: f64 = 30.0;
 const QUANTILES: [f64; 5] = [0.05, 0.25, 0.5, 0.75, 0.95];
 
-/// A cell of the axis, from which to which value, and its cases.
+/// A cell of an axis, with its ends and its cases.
 struct Stretch<'r> {
     from: f64,
     to: f64,
     rows: Vec<&'r Row>,
 }
 
-/// The cases along an axis of numbers.
+/// Distributes the cases over the cells of a numeric axis.
 fn stretches<'r>(facts: &Facts<'r>, axis: usize) -> Vec<Stretch<'r>> {
     let (spread, rows) = (&facts.spreads[axis], &facts.table.rows);
     let most = if spread.is_known() { CELLS } else { (rows.len() / EACH).clamp(4, DRAWN) };
@@ -46,17 +46,17 @@ fn stretches<'r>(facts: &Facts<'r>, axis: usize) -> Vec<Stretch<'r>> {
     let ends = (0..cells.count).filter_map(|cell| cells.ends(cell));
     let mut stretches: Vec<Stretch<'_>> = ends.map(|(from, to)| Stretch { from, to, rows: Vec::new() }).collect();
     for row in rows {
-        let cell = row.parameters.get(axis).and_then(|value| cells.of(value));
+        let cell = row.parameters.get(axis).and_then(|value| cells.index_of(value));
         cell.and_then(|cell| stretches.get_mut(cell)).into_iter().for_each(|stretch| stretch.rows.push(row));
     }
     stretches
 }
 
-/// A line of what is known of each stretch: level where that is a range, broken where nothing is known.
-fn line(stretches: &[Stretch<'_>], of: impl Fn(&[&Row]) -> Option<f64>) -> Vec<Vec<(f64, f64)>> {
+/// Returns the line of a statistic of each cell: level over a cell of drawn values, with a gap where it is unknown.
+fn line(stretches: &[Stretch<'_>], statistic: impl Fn(&[&Row]) -> Option<f64>) -> Vec<Vec<(f64, f64)>> {
     let (mut parts, mut part) = (Vec::new(), Vec::new());
     for stretch in stretches {
-        match of(&stretch.rows) {
+        match statistic(&stretch.rows) {
             Some(value) if stretch.from < stretch.to => part.extend([(stretch.from, value), (stretch.to, value)]),
             Some(value) => part.push((stretch.from, value)),
             None => parts.extend((!part.is_empty()).then(|| std::mem::take(&mut part))),
@@ -66,7 +66,7 @@ fn line(stretches: &[Stretch<'_>], of: impl Fn(&[&Row]) -> Option<f64>) -> Vec<V
     parts
 }
 
-/// The axis of the metric over all cases: by factors where that tells more.
+/// Returns the axis of the metric over all cases; logarithmic if the values span large factors.
 fn value_axis(label: &str, values: &[f64], limit: Option<f64>) -> Option<Axis> {
     let all = || values.iter().copied().chain(limit);
     let (low, high) = range(all(), false)?;
@@ -76,7 +76,7 @@ fn value_axis(label: &str, values: &[f64], limit: Option<f64>) -> Option<Axis> {
     })
 }
 
-/// The metric along an axis, and which part of the cases was accepted there; the first as wide as the page if it is the only one.
+/// Draws the metric and the percentage of accepted cases along an axis; page-wide if there is only one axis.
 pub fn along(facts: &Facts<'_>, axis: usize, alone: bool) -> Vec<(Picture, String)> {
     let (name, stretches) = (&facts.spreads[axis].name, stretches(facts, axis));
     let x = facts.spreads[axis].number_axis();
@@ -87,8 +87,8 @@ pub fn along(facts: &Facts<'_>, axis: usize, alone: bool) -> Vec<(Picture, Strin
     let (words, unit) = facts.metric_parts();
     if let Some(y) = value_axis(&unit, &all, facts.limit) {
         let title = format!("{words} along {name}");
-        let of = |part: f64| line(&stretches, |rows| quantile(&facts.sorted(rows.iter().copied()), part));
-        let [low, first, median, third, high] = QUANTILES.map(of);
+        let quantiles = |part: f64| line(&stretches, |rows| quantile(&facts.sorted(rows.iter().copied()), part));
+        let [low, first, median, third, high] = QUANTILES.map(quantiles);
         let mut svg = frame.open(&title);
         frame.axes(&x, &y, &mut svg);
         heading(&words, &frame, &mut svg);
@@ -112,15 +112,14 @@ pub fn along(facts: &Facts<'_>, axis: usize, alone: bool) -> Vec<(Picture, Strin
         let legend = lines.iter().map(|line| (line.class, line.label.clone()));
         let bands =
             [("band-inner", "25 to 75 %"), ("band-outer", "5 to 95 %")].map(|(class, text)| (class, text.to_owned()));
-        let mut caption = format!("Over all {} cases that have a value", all.len());
-        caption += if alone { "" } else { ", whatever else is varied" };
-        caption += if few { "; each is a point." } else { "." };
+        let mut caption = format!("{} cases with a value", all.len());
+        caption += if alone { "" } else { ", over all values of the other axes" };
+        caption += if few { "; a point is a case." } else { "." };
         if y.is_logarithmic() && all.first() == Some(&0.0) {
-            caption += " Zeros are drawn at the foot.";
+            caption += " Zeros are drawn at the bottom.";
         }
         if all.last().is_some_and(|value| value.is_infinite()) {
-            caption +=
-                " Where a body was lost the value is beyond all others: a band that meets the upper edge goes there.";
+            caption += " The value of a case that lost a body is infinite: its band reaches the upper edge.";
         }
         figures.push((Picture { svg, narrow: None, title, legend: legend.chain(bands).collect() }, caption));
     }
@@ -128,18 +127,18 @@ pub fn along(facts: &Facts<'_>, axis: usize, alone: bool) -> Vec<(Picture, Strin
     figures
 }
 
-/// What a picture shows, above it.
+/// Writes the heading above a chart.
 fn heading(words: &str, frame: &Frame, svg: &mut String) {
     let _ = write!(svg, "<text x=\"{}\" y=\"{TOP}\">{}</text>", frame.left, escape(words));
 }
 
-/// A level line from one end of an axis to the other.
+/// Returns a level line over the whole axis.
 fn ends(x: &Axis, value: f64) -> Vec<(f64, f64)> {
     let [low, high] = x.ends().map(|end| if x.is_logarithmic() { 10_f64.powf(end) } else { end });
     vec![(low, value), (high, value)]
 }
 
-/// Areas between two lines of the same parts.
+/// Returns the path of the areas between two lines with the same parts.
 fn band(frame: &Frame, x: &Axis, y: &Axis, below: &[Vec<(f64, f64)>], above: &[Vec<(f64, f64)>]) -> String {
     let mut path = String::new();
     for (below, above) in below.iter().zip(above) {
@@ -152,7 +151,7 @@ fn band(frame: &Frame, x: &Axis, y: &Axis, below: &[Vec<(f64, f64)>], above: &[V
     path
 }
 
-/// Which part of the cases was accepted along an axis, and of which part a rate is claimed; none where that is nowhere another.
+/// Draws the percentage of accepted cases and of cases with a claimed rate along an axis; `None` if both are constant.
 fn shares(
     facts: &Facts<'_>,
     name: &str,
@@ -178,10 +177,10 @@ fn shares(
         return None;
     }
     let y = Axis::linear("%", -2.0, 102.0);
-    let title = format!("part accepted along {name}");
+    let title = format!("accepted cases along {name}");
     let mut svg = frame.open(&title);
     frame.axes(x, &y, &mut svg);
-    heading("part of the cases that was accepted", frame, &mut svg);
+    heading("percentage of accepted cases", frame, &mut svg);
     let _ = write!(
         svg,
         "<path class=\"line grey d1\" d=\"M{} {:.1}h{}\"/>",
@@ -192,18 +191,17 @@ fn shares(
     lines.iter().for_each(|line| frame.line(line, x, &y, &mut svg));
     svg.push_str("</svg>");
     let legend = lines.iter().map(|line| (line.class, line.label.clone())).collect();
-    let caption =
-        "Of the cases with a verdict, the part that was accepted; where a line crosses the dashed one, it is half.";
+    let caption = "Percentage of the judged cases that were accepted. The dashed line marks 50 %.";
     Some((Picture { svg, narrow: None, title, legend }, caption.to_owned()))
 }
 
-/// How many of the cases have a value no larger than this one.
-pub fn distribution(title: &str, label: &str, sorted: &[f64], of: usize, limit: Option<f64>) -> Option<Picture> {
+/// Draws the cumulative distribution of sorted values, as a percentage of `cases`.
+pub fn distribution(title: &str, label: &str, sorted: &[f64], cases: usize, limit: Option<f64>) -> Option<Picture> {
     let x = value_axis(label, sorted, limit)?;
-    let y = Axis::linear("part of the cases, %", 0.0, 100.0);
+    let y = Axis::linear("cases, %", 0.0, 100.0);
     let frame = Frame { width: WIDTH, height: TALL, top: TOP, left: LEFT, right: RIGHT };
     let finite: Vec<f64> = sorted.iter().copied().filter(|value| value.is_finite()).collect();
-    let part = |rank: usize| 100.0 * rank as f64 / of.max(1) as f64;
+    let part = |rank: usize| 100.0 * rank as f64 / cases.max(1) as f64;
     let stride = finite.len().div_ceil(CURVE).max(1);
     let ranks = (0..finite.len()).filter(|rank| rank % stride == 0 || rank + 1 == finite.len());
     let mut points = Vec::new();

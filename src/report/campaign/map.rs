@@ -1,6 +1,6 @@
-//! Maps of two axes: the decisive metric in shades, with the border of acceptance and that of the certificate's claim.
+//! Maps over two axes: the decisive metric as shades, with the borders of acceptance and of the certificate's claim.
 //!
-//! A border lies between two cells, never within one. Must not smooth or fill in: a cell without a case is empty.
+//! A border runs between cells, never through one. Must not interpolate: a cell without a case is empty.
 
 use super::facts::{Facts, claimed_share, share};
 use super::number::few;
@@ -17,37 +17,37 @@ use std::fmt::Write;
 /// The height of a map, and of each of several.
 const HEIGHT: f64 = 430.0;
 const PANEL: f64 = 250.0;
-/// Room for the scale at the right, and for what is written above a map.
+/// The width of the scale on the right, and the height of the heading.
 const SCALE: f64 = 104.0;
 const ABOVE: f64 = 16.0;
-/// So many maps are beside each other.
+/// The largest number of maps in a row.
 const COLUMNS: usize = 3;
-/// The most letters of a label beside an axis, each so wide.
+/// The largest number of letters of a label beside an axis, and the width of a letter.
 const LABEL: usize = 14;
 const LETTER: f64 = 6.9;
-/// Half of the cases of a cell: the border.
+/// The fraction of cases at which a border lies.
 const HALF: f64 = 0.5;
-/// The border of the claim is drawn beside the cells' edge, on the side that is claimed.
+/// The distance of the claim's border from the edge of the cells, on the side with a claimed rate.
 const ASIDE: f64 = 3.5;
 
-/// Classes and names of the borders.
+/// The classes and names of the borders.
 const ACCEPTANCE: (&str, &str) = ("k bold", "border of acceptance");
 const CLAIM: (&str, &str) = ("b d1 bold", "border of the certificate’s claim");
 
-/// What a map's shades tell.
+/// The quantity of a map's shades.
 #[derive(Debug, Clone, Copy)]
 pub enum Paint<'a> {
     /// The decisive metric.
     Metric(&'a Shades),
-    /// Which part of the cases was accepted.
+    /// The fraction of accepted cases.
     Share(&'a Shades),
 }
 
-/// What the cases of a cell have in common.
+/// The results of the cases in a cell.
 #[derive(Debug, Default)]
 struct Cell {
     rows: u64,
-    /// The median of the metric; none if no case has a value.
+    /// The median of the metric; `None` if no case has a value.
     value: Option<f64>,
     judged: u64,
     accepted: u64,
@@ -57,18 +57,18 @@ struct Cell {
     worst: u64,
 }
 
-/// A map of two axes.
+/// A map over two axes.
 pub struct Map<'a> {
     facts: &'a Facts<'a>,
     spreads: [&'a Spread; 2],
     cells: [Cells<'a>; 2],
-    /// Row by row, from the foot.
+    /// The cells, row by row from the bottom.
     grid: Vec<Cell>,
 }
 
 impl<'a> Map<'a> {
-    /// A map of some of the cases, with at most so many cells in each direction.
-    pub fn of<'r>(
+    /// Returns a map of the given cases, with at most `most` cells in each direction.
+    pub fn new<'r>(
         facts: &'a Facts<'a>,
         axes: [usize; 2],
         most: usize,
@@ -78,26 +78,26 @@ impl<'a> Map<'a> {
         let cells = spreads.map(|spread| spread.cells(most));
         let mut sorted: Vec<Vec<&Row>> = vec![Vec::new(); cells[0].count * cells[1].count];
         for row in rows {
-            let [x, y] = [0, 1].map(|n| row.parameters.get(axes[n]).and_then(|value| cells[n].of(value)));
+            let [x, y] = [0, 1].map(|n| row.parameters.get(axes[n]).and_then(|value| cells[n].index_of(value)));
             if let (Some(x), Some(y)) = (x, y) {
                 sorted[y * cells[0].count + x].push(row);
             }
         }
-        let grid = sorted.iter().map(|rows| Cell::of(facts, rows)).collect();
+        let grid = sorted.iter().map(|rows| Cell::new(facts, rows)).collect();
         Self { facts, spreads, cells, grid }
     }
 
-    /// The values of all cells.
+    /// Returns the values of all cells.
     pub fn values(&self) -> impl Iterator<Item = f64> {
         self.grid.iter().filter_map(|cell| cell.value)
     }
 
-    /// The most cases of a cell.
+    /// Returns the largest number of cases in a cell.
     pub fn most(&self) -> u64 {
         self.grid.iter().map(|cell| cell.rows).max().unwrap_or(0)
     }
 
-    /// Whether there is anything in it.
+    /// Returns true if the map has no case.
     pub fn is_empty(&self) -> bool {
         self.most() == 0
     }
@@ -106,37 +106,37 @@ impl<'a> Map<'a> {
         self.grid.get(y * self.cells[0].count + x).filter(|_| x < self.cells[0].count)
     }
 
-    /// The edges between cells on whose sides a share lies on different sides of a half: from the one that has more.
-    fn border(&self, of: impl Fn(&Cell) -> Option<f64>) -> Vec<([f64; 2], [f64; 2], [f64; 2])> {
+    /// Returns the edges between cells at which a fraction crosses one half, with the direction towards the larger side.
+    fn border(&self, fraction: impl Fn(&Cell) -> Option<f64>) -> Vec<([f64; 2], [f64; 2], [f64; 2])> {
         let [across, up] = self.cells;
         let mut edges = Vec::new();
         for (x, y) in (0..up.count).flat_map(|y| (0..across.count).map(move |x| (x, y))) {
-            let share = |x, y| self.at(x, y).and_then(&of).map(|share| share >= HALF);
+            let share = |x, y| self.at(x, y).and_then(&fraction).map(|share| share >= HALF);
             let ((left, right), (low, high)) = (across.edges(x), up.edges(y));
             let Some(own) = share(x, y) else { continue };
-            if share(x + 1, y).is_some_and(|other| other != own) {
+            if share(x + 1, y).is_some_and(|neighbour| neighbour != own) {
                 edges.push(([right, low], [right, high], [if own { -1.0 } else { 1.0 }, 0.0]));
             }
-            if share(x, y + 1).is_some_and(|other| other != own) {
+            if share(x, y + 1).is_some_and(|neighbour| neighbour != own) {
                 edges.push(([left, high], [right, high], [0.0, if own { 1.0 } else { -1.0 }]));
             }
         }
         edges
     }
 
-    /// Where the axes lie.
+    /// Returns the axes of a map.
     fn axes(&self, frame: &Frame) -> [Axis; 2] {
         [self.spreads[0].axis(frame.plot_width(), true), self.spreads[1].axis(frame.plot_height(), false)]
     }
 
-    /// The margin that the labels of the upright axis need.
+    /// Returns the left margin that the labels of the y axis need.
     fn left(&self, height: f64) -> f64 {
         let axis = self.spreads[1].axis(height, false);
         let longest = axis.ticks.iter().map(|(_, label)| label.chars().count()).max().unwrap_or(0).min(LABEL);
         LEFT.max(longest as f64 * LETTER + 32.0)
     }
 
-    /// Draws cells, axes and borders, and tells which borders there are.
+    /// Draws cells, axes and borders; returns which borders were drawn.
     fn draw(&self, frame: &Frame, paint: Paint<'_>, svg: &mut String) -> [bool; 2] {
         let [x_axis, y_axis] = self.axes(frame);
         frame.axes(&x_axis, &y_axis, svg);
@@ -175,7 +175,7 @@ impl<'a> Map<'a> {
         borders.map(|edges| !edges.is_empty())
     }
 
-    /// What a cell says.
+    /// Returns the description of a cell.
     fn words(&self, x: usize, y: usize, cell: &Cell) -> String {
         let [across, up] = [self.cells[0].name(x), self.cells[1].name(y)];
         let value = match cell.value {
@@ -201,50 +201,50 @@ impl<'a> Map<'a> {
         )
     }
 
-    /// Swatches for cells that have no shade.
-    fn others(&self, paint: Paint<'_>) -> Vec<(&'static str, &'static str)> {
+    /// Returns the swatches of cells without a shade.
+    fn swatches(&self, paint: Paint<'_>) -> Vec<(&'static str, &'static str)> {
         let has = |class: &str| self.grid.iter().any(|cell| cell.rows > 0 && cell.class(paint) == class);
-        let void = if matches!(paint, Paint::Metric(_)) { "no value" } else { "not judged" };
-        [("gone", "body lost"), ("void", void)].into_iter().filter(|(class, _)| has(class)).collect()
+        let unknown = if matches!(paint, Paint::Metric(_)) { "no value" } else { "not judged" };
+        [("gone", "body lost"), ("void", unknown)].into_iter().filter(|(class, _)| has(class)).collect()
     }
 
-    /// What its shades are, above it.
+    /// Returns the heading, which names the quantity of the shades.
     fn heading(&self, paint: Paint<'_>, most: u64) -> String {
         match paint {
-            Paint::Metric(_) if most > 1 => format!("median of the cases of a cell: {}", self.facts.metric_name()),
+            Paint::Metric(_) if most > 1 => format!("median per cell: {}", self.facts.metric_name()),
             Paint::Metric(_) => self.facts.metric_name(),
-            Paint::Share(_) => "part of the cases of a cell that were accepted".to_owned(),
+            Paint::Share(_) => "accepted cases per cell".to_owned(),
         }
     }
 
-    /// The map as a picture.
+    /// Draws the map.
     pub fn picture(&self, paint: Paint<'_>) -> Picture {
         let frame = Frame { width: WIDTH, height: HEIGHT, top: TOP + ABOVE, left: self.left(HEIGHT), right: SCALE };
-        let what = if matches!(paint, Paint::Metric(_)) { "map" } else { "part accepted" };
-        let title = format!("{what}: {} over {}", self.spreads[1].name, self.spreads[0].name);
+        let quantity = if matches!(paint, Paint::Metric(_)) { "map" } else { "acceptance" };
+        let title = format!("{quantity}: {} over {}", self.spreads[1].name, self.spreads[0].name);
         let mut svg = frame.open(&title);
         let _ =
             write!(svg, "<text x=\"{}\" y=\"{TOP}\">{}</text>", frame.left, escape(&self.heading(paint, self.most())));
         let borders = self.draw(&frame, paint, &mut svg);
-        paint.scale(&frame, self.facts.limit, &self.others(paint), &mut svg);
+        paint.scale(&frame, self.facts.limit, &self.swatches(paint), &mut svg);
         svg.push_str("</svg>");
         Picture { svg, narrow: None, title, legend: legend(borders) }
     }
 }
 
-/// Several maps of the same axes beside each other, each with what it is of.
+/// Draws several maps of the same axes, each with its name.
 pub fn panels(maps: &[(String, Map<'_>)], shades: &Shades) -> Option<Picture> {
     let (_, first) = maps.first()?;
     let paint = Paint::Metric(shades);
     let columns = maps.len().min(COLUMNS);
     let (width, rows) = ((WIDE - SCALE) / columns as f64, maps.len().div_ceil(columns));
     let height = PANEL * rows as f64 + 2.0 * ABOVE;
-    let title = format!("maps: {} over {}, apart", first.spreads[1].name, first.spreads[0].name);
+    let title = format!("maps: {} over {}, separate", first.spreads[1].name, first.spreads[0].name);
     let whole = Frame { width: WIDE, height, top: TOP + 2.0 * ABOVE, left: first.left(PANEL), right: SCALE };
     let mut svg = whole.open(&title);
     let most = maps.iter().map(|(_, map)| map.most()).max().unwrap_or(0);
     let _ = write!(svg, "<text x=\"{}\" y=\"{TOP}\">{}</text>", whole.left, escape(&first.heading(paint, most)));
-    let (mut borders, mut others) = ([false; 2], Vec::new());
+    let (mut borders, mut swatches) = ([false; 2], Vec::new());
     for (place, (name, map)) in maps.iter().enumerate() {
         let (x, y) = ((place % columns) as f64 * width, (place / columns) as f64 * PANEL + ABOVE);
         let frame = Frame { width, height: PANEL, top: TOP + ABOVE, left: whole.left, right: 14.0 };
@@ -256,12 +256,12 @@ pub fn panels(maps: &[(String, Map<'_>)], shades: &Shades) -> Option<Picture> {
         );
         let drawn = map.draw(&frame, paint, &mut svg);
         borders = [borders[0] || drawn[0], borders[1] || drawn[1]];
-        others.extend(map.others(paint));
+        swatches.extend(map.swatches(paint));
         svg.push_str("</g>");
     }
-    others.sort_unstable();
-    others.dedup();
-    paint.scale(&whole, first.facts.limit, &others, &mut svg);
+    swatches.sort_unstable();
+    swatches.dedup();
+    paint.scale(&whole, first.facts.limit, &swatches, &mut svg);
     svg.push_str("</svg>");
     Some(Picture { svg, narrow: None, title, legend: legend(borders) })
 }
@@ -272,24 +272,24 @@ fn legend(borders: [bool; 2]) -> Vec<(&'static str, String)> {
 }
 
 impl Paint<'_> {
-    fn scale(self, frame: &Frame, limit: Option<f64>, others: &[(&str, &str)], svg: &mut String) {
+    fn scale(self, frame: &Frame, limit: Option<f64>, swatches: &[(&str, &str)], svg: &mut String) {
         match self {
-            Self::Metric(shades) => shades.scale(frame, limit, others, svg),
-            Self::Share(shades) => shades.scale(frame, Some(HALF), others, svg),
+            Self::Metric(shades) => shades.scale(frame, limit, swatches, svg),
+            Self::Share(shades) => shades.scale(frame, Some(HALF), swatches, svg),
         }
     }
 }
 
 impl Cell {
-    fn of(facts: &Facts<'_>, rows: &[&Row]) -> Self {
+    fn new(facts: &Facts<'_>, rows: &[&Row]) -> Self {
         let rows = || rows.iter().copied();
         let judged = || rows().filter_map(|row| row.accepted);
         let size = |row: &Row| facts.value(row).unwrap_or(f64::NEG_INFINITY);
         let refused = |row: &Row| row.accepted == Some(false);
-        // Of equal ones the first.
-        let worst = rows().max_by(|one, other| {
-            let larger = size(one).total_cmp(&size(other));
-            larger.then(refused(one).cmp(&refused(other))).then(other.case.cmp(&one.case))
+        // Of equal cases the first one wins.
+        let worst = rows().max_by(|a, b| {
+            let larger = size(a).total_cmp(&size(b));
+            larger.then(refused(a).cmp(&refused(b))).then(b.case.cmp(&a.case))
         });
         Self {
             rows: rows().count() as u64,
@@ -302,7 +302,7 @@ impl Cell {
         }
     }
 
-    /// The class of its colour.
+    /// Returns the class of the cell's colour.
     fn class(&self, paint: Paint<'_>) -> &'static str {
         const SHADE: [&str; 8] = ["shade0", "shade1", "shade2", "shade3", "shade4", "shade5", "shade6", "shade7"];
         let (shades, value) = match paint {

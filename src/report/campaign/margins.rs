@@ -1,6 +1,6 @@
-//! Margins: how far a key can go, at every point that was searched, in a table and along an axis of numbers.
+//! Margins: the extreme value of a key at every searched point, as a table and along a numeric axis.
 //!
-//! Must not put a margin where its bracket has only one end: then it is beyond what was searched, and that is said.
+//! Must not draw a margin whose bracket has only one end as a value: it lies beyond the searched range.
 
 use super::facts::Facts;
 use super::shades::{by_factors, range};
@@ -12,14 +12,14 @@ use crate::report::frame::{Frame, LEFT, Line, RIGHT, TOP, WIDTH};
 use crate::report::model::{Block, Section};
 use std::fmt::Write;
 
-/// A table has at most so many rows.
+/// The largest number of rows of a table.
 const ROWS: usize = 200;
-/// A picture has at most so many lines: one per value of a second axis.
+/// The largest number of lines of a chart, one per value of a second axis.
 const LINES: usize = 4;
 const CLASSES: [&str; LINES] = ["b d0", "o d1", "g d3", "p d4"];
 const HEIGHT: f64 = 300.0;
 
-/// The margins of a campaign; none if none is searched for.
+/// Builds the section of margins; `None` if the campaign searches for none.
 pub fn section(facts: &Facts<'_>) -> Option<Section> {
     let margins = &facts.table.margins;
     let blocks: Vec<Block> = margins.iter().flat_map(|margin| blocks(facts, margin)).collect();
@@ -28,31 +28,28 @@ pub fn section(facts: &Facts<'_>) -> Option<Section> {
 
 fn blocks(facts: &Facts<'_>, margin: &Margin) -> Vec<Block> {
     let [from, to] = margin.range.map(digits);
-    let which = if margin.find == Find::Largest { "largest" } else { "smallest" };
+    let extreme = if margin.find == Find::Largest { "largest" } else { "smallest" };
     let text = format!(
-        "The {which} {} between {from} and {to} at which a case is {}: the range is halved until the bracket is at most {} wide. \
-         Where that changes more than once, one change is found.",
+        "The {extreme} {} between {from} and {to} at which a case is {}, found by bisection to a tolerance of {}. If the result \
+         changes more than once in the range, bisection finds one of the changes.",
         margin.key,
         margin.such_that,
         digits(margin.tolerance)
     );
     let mut blocks = vec![Block::Text(text)];
     if margin.points.is_empty() {
-        blocks.push(Block::Text("No point of it has been searched yet.".to_owned()));
+        blocks.push(Block::Text("No point has been searched yet.".to_owned()));
         return blocks;
     }
     blocks.extend(picture(facts, margin).map(|figure| Block::Figures(vec![figure])));
     blocks.push(table(facts, margin));
     if margin.points.len() > ROWS {
-        blocks.push(Block::Text(format!(
-            "The first {ROWS} of {} points; the others are not shown.",
-            margin.points.len()
-        )));
+        blocks.push(Block::Text(format!("The table shows the first {ROWS} of {} points.", margin.points.len())));
     }
     blocks
 }
 
-/// The axes on which a margin's points lie.
+/// Returns the axes that vary between the points of a margin.
 fn axes(facts: &Facts<'_>, margin: &Margin) -> Vec<usize> {
     let known = |axis: &usize| margin.points.iter().any(|point| point.parameter(*axis).is_some());
     (0..facts.spreads.len()).filter(|axis| facts.spreads[*axis].varies()).filter(known).collect()
@@ -66,7 +63,7 @@ fn table(facts: &Facts<'_>, margin: &Margin) -> Block {
     Block::table(&margin.key, head, rows)
 }
 
-/// A margin along an axis of numbers, a line for each value of another.
+/// Draws a margin along a numeric axis, with a line for each value of a second axis.
 fn picture(facts: &Facts<'_>, margin: &Margin) -> Option<(Picture, String)> {
     let axes = axes(facts, margin);
     let across = *axes.iter().find(|axis| facts.spreads[**axis].is_numeric())?;
@@ -87,17 +84,17 @@ fn picture(facts: &Facts<'_>, margin: &Margin) -> Option<(Picture, String)> {
     let cells = second.map(|axis| facts.spreads[axis].cells(LINES));
     let (mut lines, mut open) = (Vec::new(), 0);
     for group in 0..cells.map_or(1, |cells| cells.count) {
-        let of = |point: &&MarginPoint| match (second, cells) {
-            (Some(axis), Some(cells)) => point.parameter(axis).and_then(|value| cells.of(value)) == Some(group),
+        let in_group = |point: &&MarginPoint| match (second, cells) {
+            (Some(axis), Some(cells)) => point.parameter(axis).and_then(|value| cells.index_of(value)) == Some(group),
             _ => true,
         };
         let mut points: Vec<(f64, &MarginPoint)> = margin
             .points
             .iter()
-            .filter(of)
+            .filter(in_group)
             .filter_map(|point| Some((point.parameter(across)?.number()?, point)))
             .collect();
-        points.sort_by(|one, other| one.0.total_cmp(&other.0));
+        points.sort_by(|a, b| a.0.total_cmp(&b.0));
         let class = CLASSES[group % LINES];
         for (place, point) in &points {
             let [good, bad] = point.bracket;
@@ -125,20 +122,20 @@ fn picture(facts: &Facts<'_>, margin: &Margin) -> Option<(Picture, String)> {
             (Some(axis), Some(cells)) => format!("{} = {}", facts.spreads[axis].name, cells.name(group)),
             _ => "margin".to_owned(),
         };
-        // Several margins at one place, as seeds give them, are points and no line.
-        let apart = points.windows(2).all(|pair| pair[0].0 < pair[1].0);
+        // Several margins at one place, from several seeds, are drawn as points without a line.
+        let distinct = points.windows(2).all(|pair| pair[0].0 < pair[1].0);
         let places = points.iter().filter_map(|(place, point)| Some((*place, point.value?)));
-        let parts = if apart { vec![places.collect()] } else { places.map(|place| vec![place]).collect() };
+        let parts = if distinct { vec![places.collect()] } else { places.map(|place| vec![place]).collect() };
         lines.push(Line { class, label: name, parts, dot: false });
     }
     lines.iter().for_each(|line| frame.line(line, &x, &y, &mut svg));
     svg.push_str("</svg>");
-    let mut caption = "The margin, with its bracket: it holds at one end, and does not at the other.".to_owned();
+    let mut caption = "The margin with its bracket: the condition holds at one end and fails at the other.".to_owned();
     if open > 0 {
-        let _ = write!(caption, " A triangle is a margin that is beyond the range ({open} points).");
+        let _ = write!(caption, " A triangle marks a margin beyond the searched range ({open} points).");
     }
     if axes.len() > 2 {
-        caption += " Other axes are varied too: their points are in the same lines.";
+        caption += " The lines contain the points of all values of the other axes.";
     }
     let legend = lines.iter().map(|line| (line.class, line.label.clone())).collect();
     Some((Picture { svg, narrow: None, title, legend }, caption))

@@ -1,6 +1,6 @@
-//! Numbers as the page of a campaign shows them.
+//! Formatting of numbers on the page of a campaign.
 
-/// A number in few digits, as people read it.
+/// Formats a number with three significant digits; infinity, the value of a lost body, as `lost`.
 pub fn few(value: f64) -> String {
     if value.is_infinite() {
         return "lost".to_owned();

@@ -1,6 +1,6 @@
-//! Cases as points over two axes: the verdict is a point's form and edge, the metric its shade. And points over one axis.
+//! Cases as points: form and edge show the verdict, the shade shows the metric.
 //!
-//! Must not leave out a case silently: of more cases than can be told apart there are maps instead.
+//! Must not omit a case: if there are too many points to distinguish, the page has a map instead.
 
 use super::facts::Facts;
 use super::number::few;
@@ -11,18 +11,18 @@ use crate::report::frame::{Frame, LEFT, TOP, WIDTH};
 use crate::report::html::escape;
 use std::fmt::Write;
 
-/// So many cases can be told apart as points.
+/// The largest number of cases that are drawn as points.
 pub const POINTS: usize = 1000;
 const HEIGHT: f64 = 430.0;
 const SCALE: f64 = 104.0;
 const ABOVE: f64 = 32.0;
 /// The width of a letter of the key.
 const LETTER: f64 = 6.9;
-/// The most letters of a label beside an axis.
+/// The largest number of letters of a label beside an axis.
 const LABEL: usize = 14;
 const ALL: [Verdict; 3] = [Verdict::Accepted, Verdict::Refused, Verdict::Open];
 
-/// What was said of a case.
+/// The verdict of a case.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Verdict {
     Accepted,
@@ -31,7 +31,7 @@ enum Verdict {
 }
 
 impl Verdict {
-    fn of(row: &Row) -> Self {
+    fn from_row(row: &Row) -> Self {
         match row.accepted {
             Some(true) => Self::Accepted,
             Some(false) => Self::Refused,
@@ -47,7 +47,7 @@ impl Verdict {
         }
     }
 
-    /// A circle, a diamond, a square, filled by a class.
+    /// Draws a circle, diamond or square, filled by a class.
     fn draw(self, x: f64, y: f64, fill: &str, title: &str, svg: &mut String) {
         let title = if title.is_empty() { String::new() } else { format!("<title>{}</title>", escape(title)) };
         let (class, form) = match self {
@@ -59,11 +59,11 @@ impl Verdict {
     }
 }
 
-/// A row of the forms that occur, with how many there are, from a place on.
+/// Draws the key of the verdicts that occur, with their counts, at a position.
 pub fn key<'r>(rows: impl IntoIterator<Item = &'r Row>, mut x: f64, y: f64, svg: &mut String) {
-    let verdicts: Vec<Verdict> = rows.into_iter().map(Verdict::of).collect();
+    let verdicts: Vec<Verdict> = rows.into_iter().map(Verdict::from_row).collect();
     for verdict in ALL {
-        let count = verdicts.iter().filter(|one| **one == verdict).count();
+        let count = verdicts.iter().filter(|found| **found == verdict).count();
         if count > 0 {
             let text = format!("{} ({count})", verdict.words());
             verdict.draw(x + 5.0, y - 4.0, "plain", "", svg);
@@ -73,18 +73,18 @@ pub fn key<'r>(rows: impl IntoIterator<Item = &'r Row>, mut x: f64, y: f64, svg:
     }
 }
 
-/// A case as a point at a place, told in words.
+/// Draws a case as a point at a position, with its description.
 pub fn point(facts: &Facts<'_>, row: &Row, x: f64, y: f64, fill: &str, svg: &mut String) {
-    Verdict::of(row).draw(x, y, fill, &words(facts, row), svg);
+    Verdict::from_row(row).draw(x, y, fill, &words(facts, row), svg);
 }
 
-/// What a case is; its values are on the axes.
+/// Returns the description of a case, without its parameters, which the axes show.
 fn words(facts: &Facts<'_>, row: &Row) -> String {
     let value = facts.value(row).map_or("no value".to_owned(), few);
     format!("case {}: {value}; {}", row.case, row.verdict)
 }
 
-/// All cases over two axes.
+/// Draws all cases over two axes.
 pub fn scatter(facts: &Facts<'_>, axes: [usize; 2], shades: Option<&Shades>) -> Picture {
     let spreads = axes.map(|axis| &facts.spreads[axis]);
     let mut frame = Frame { width: WIDTH, height: HEIGHT, top: TOP + ABOVE, left: LEFT, right: SCALE };
@@ -97,8 +97,8 @@ pub fn scatter(facts: &Facts<'_>, axes: [usize; 2], shades: Option<&Shades>) -> 
     let _ = write!(svg, "<text x=\"{}\" y=\"{TOP}\">{}</text>", frame.left, escape(&facts.metric_name()));
     key(&facts.table.rows, frame.left, TOP + 19.0, &mut svg);
     frame.axes(&across, &up, &mut svg);
-    let mut others = Vec::new();
-    // What failed lies on what did not.
+    let mut swatches = Vec::new();
+    // Cases that were not accepted are drawn above the accepted ones.
     let mut rows: Vec<&Row> = facts.table.rows.iter().collect();
     rows.sort_by_key(|row| (row.accepted == Some(false), row.case));
     for row in rows {
@@ -111,16 +111,16 @@ pub fn scatter(facts: &Facts<'_>, axes: [usize; 2], shades: Option<&Shades>) -> 
             (None, _) => "void".to_owned(),
         };
         match fill.as_str() {
-            "gone" => others.push(("gone", "body lost")),
-            "void" => others.push(("void", "no value")),
+            "gone" => swatches.push(("gone", "body lost")),
+            "void" => swatches.push(("void", "no value")),
             _ => {}
         }
         point(facts, row, x, y, &fill, &mut svg);
     }
-    others.sort_unstable();
-    others.dedup();
+    swatches.sort_unstable();
+    swatches.dedup();
     if let Some(shades) = shades {
-        shades.scale(&frame, facts.limit, &others, &mut svg);
+        shades.scale(&frame, facts.limit, &swatches, &mut svg);
     }
     svg.push_str("</svg>");
     Picture { svg, narrow: None, title, legend: Vec::new() }

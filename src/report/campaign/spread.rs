@@ -1,24 +1,24 @@
-//! How the values of an axis lie: one by one, or drawn from a range; and the cells that they fall into.
+//! The spread of an axis: a list of values or a range of drawn ones; and the cells that it is divided into.
 //!
-//! Must not know what is measured.
+//! Must not know metrics.
 
 use super::number::few;
 use crate::campaign::{AxisKind, Parameter, Table};
 use crate::report::axis::Axis;
 
-/// Of drawn values that differ by no more than this, as whole numbers do, each is one of its own.
+/// The largest number of distinct drawn values, such as whole numbers, that count as a list.
 const WHOLE: usize = 24;
-/// So many known values are written by name; of more the axis has round numbers.
+/// The largest number of listed values that an axis labels one by one; a longer list gets ticks at round numbers.
 const NAMED: usize = 8;
-/// Steps of an even axis differ by no more than this part.
+/// The largest deviation of an even axis from equal steps, as a fraction of a step.
 const EVEN: f64 = 1e-3;
 
 /// An axis and its values.
 #[derive(Debug, Clone)]
 pub struct Spread {
-    /// What it is called.
+    /// The label, or the key.
     pub name: String,
-    /// Its key.
+    /// The key.
     pub key: String,
     is_numeric: bool,
     logarithmic: bool,
@@ -27,9 +27,9 @@ pub struct Spread {
 
 #[derive(Debug, Clone)]
 enum Values {
-    /// Each of these; numbers rise.
+    /// A list of values; numbers rise.
     Known(Vec<Parameter>),
-    /// Anything from one to the other.
+    /// A range of drawn values.
     Between(f64, f64),
 }
 
@@ -37,15 +37,15 @@ enum Values {
 #[derive(Debug, Clone, Copy)]
 pub struct Cells<'a> {
     spread: &'a Spread,
-    /// So many known values are one cell.
+    /// The number of listed values per cell.
     group: usize,
-    /// How many there are.
+    /// The number of cells.
     pub count: usize,
 }
 
 impl Spread {
-    /// How an axis of a table is spread.
-    pub fn of(table: &Table, axis: usize) -> Self {
+    /// Returns the spread of an axis of a table.
+    pub fn new(table: &Table, axis: usize) -> Self {
         let varied = &table.axes[axis];
         let mut values: Vec<Parameter> = varied.values.clone();
         if values.is_empty() {
@@ -53,8 +53,8 @@ impl Spread {
         }
         let numbers = values.iter().all(|value| value.number().is_some_and(f64::is_finite));
         if numbers {
-            values.sort_by(|one, other| at(one).total_cmp(&at(other)));
-            values.dedup_by(|one, other| same(one, other));
+            values.sort_by(|a, b| at(a).total_cmp(&at(b)));
+            values.dedup_by(|a, b| same(a, b));
         } else {
             let mut known: Vec<Parameter> = Vec::new();
             values.into_iter().for_each(|value| {
@@ -76,17 +76,17 @@ impl Spread {
         }
     }
 
-    /// Whether its values are numbers.
+    /// Returns true if all values are numbers.
     pub fn is_numeric(&self) -> bool {
         self.is_numeric
     }
 
-    /// Whether each of its values is known, and not any within a range.
+    /// Returns true if the axis has a list of values, not a range.
     pub fn is_known(&self) -> bool {
         matches!(self.values, Values::Known(_))
     }
 
-    /// Whether there is more than one value.
+    /// Returns true if the axis has more than one value.
     pub fn varies(&self) -> bool {
         match &self.values {
             Values::Known(values) => values.len() > 1,
@@ -94,7 +94,7 @@ impl Spread {
         }
     }
 
-    /// What it takes, in words.
+    /// Returns the values in words.
     pub fn words(&self) -> String {
         match &self.values {
             Values::Known(values) if values.is_empty() => "–".to_owned(),
@@ -109,7 +109,7 @@ impl Spread {
         }
     }
 
-    /// Its cells: one per value, or at most so many.
+    /// Returns the cells: one per value, but at most `most`.
     pub fn cells(&self, most: usize) -> Cells<'_> {
         match &self.values {
             Values::Known(values) => {
@@ -129,7 +129,7 @@ impl Spread {
         values.get(place).filter(|known| same(known, value)).map(|_| place)
     }
 
-    /// Where a value is on the axis of its cells, from 0 to 1.
+    /// Returns the position of a value on the axis of cells, from 0 to 1.
     pub fn place(&self, value: &Parameter) -> Option<f64> {
         match &self.values {
             Values::Known(values) => Some((self.index(value)? as f64 + 0.5) / values.len() as f64),
@@ -143,7 +143,7 @@ impl Spread {
         }
     }
 
-    /// The axis of its cells, `room` px long: of values where these are even, else of names.
+    /// Returns the axis of cells, `room` px long: of numbers if they are even, else of names.
     pub fn axis(&self, room: f64, across: bool) -> Axis {
         let linear = |low: f64, high: f64| Axis::linear(&self.name, low, high);
         let log = |low: f64, high: f64| Axis::log_between(&format!("{}, logarithmic", self.name), low, high);
@@ -154,9 +154,9 @@ impl Spread {
         let numbers: Vec<f64> = values.iter().filter_map(Parameter::number).collect();
         let last = numbers.len().max(1) - 1;
         if numbers.len() == values.len() && numbers.len() > NAMED {
-            let of = |value: f64| if self.logarithmic { value.ln() } else { value };
-            let (first, step) = (of(numbers[0]), (of(numbers[last]) - of(numbers[0])) / last as f64);
-            let even = |(n, value): (usize, &f64)| (of(*value) - first - n as f64 * step).abs() <= EVEN * step;
+            let scaled = |value: f64| if self.logarithmic { value.ln() } else { value };
+            let (first, step) = (scaled(numbers[0]), (scaled(numbers[last]) - scaled(numbers[0])) / last as f64);
+            let even = |(n, value): (usize, &f64)| (scaled(*value) - first - n as f64 * step).abs() <= EVEN * step;
             if numbers.iter().enumerate().all(even) {
                 let [low, high] = [first - step / 2.0, first + (last as f64 + 0.5) * step];
                 return if self.logarithmic { log(low.exp(), high.exp()) } else { linear(low, high) };
@@ -165,7 +165,7 @@ impl Spread {
         Axis::names(&self.name, &values.iter().map(shown).collect::<Vec<_>>(), room, across)
     }
 
-    /// An axis on which every number is where it belongs.
+    /// Returns the axis of the numbers themselves.
     pub fn number_axis(&self) -> Axis {
         let (low, high) = match &self.values {
             Values::Known(values) => (values.first().map_or(0.0, at), values.last().map_or(0.0, at)),
@@ -179,15 +179,15 @@ impl Spread {
 }
 
 impl Cells<'_> {
-    /// The cell of a value.
-    pub fn of(&self, value: &Parameter) -> Option<usize> {
+    /// Returns the index of the cell that contains a value.
+    pub fn index_of(&self, value: &Parameter) -> Option<usize> {
         match self.spread.values {
             Values::Known(_) => self.spread.index(value).map(|index| index / self.group),
             Values::Between(..) => Some(((self.spread.place(value)? * self.count as f64) as usize).min(self.count - 1)),
         }
     }
 
-    /// Where a cell begins and ends on the axis, from 0 to 1.
+    /// Returns the edges of a cell on the axis, from 0 to 1.
     pub fn edges(&self, cell: usize) -> (f64, f64) {
         let all = match &self.spread.values {
             Values::Known(values) => values.len() as f64 / self.group as f64,
@@ -196,12 +196,12 @@ impl Cells<'_> {
         (cell as f64 / all, ((cell + 1) as f64 / all).min(1.0))
     }
 
-    /// The values from which and to which a cell of numbers goes.
+    /// Returns the smallest and largest value of a numeric cell.
     pub fn ends(&self, cell: usize) -> Option<(f64, f64)> {
         match &self.spread.values {
             Values::Known(values) => {
-                let of = &values[cell * self.group..((cell + 1) * self.group).min(values.len())];
-                Some((of.first()?.number()?, of.last()?.number()?))
+                let group = &values[cell * self.group..((cell + 1) * self.group).min(values.len())];
+                Some((group.first()?.number()?, group.last()?.number()?))
             }
             Values::Between(low, high) => {
                 let (from, to) = self.edges(cell);
@@ -214,20 +214,20 @@ impl Cells<'_> {
         }
     }
 
-    /// What a cell is called.
+    /// Returns the name of a cell.
     pub fn name(&self, cell: usize) -> String {
         if let Values::Known(values) = &self.spread.values {
-            let of = &values[cell * self.group..((cell + 1) * self.group).min(values.len())];
-            return match of {
+            let group = &values[cell * self.group..((cell + 1) * self.group).min(values.len())];
+            return match group {
                 [] => String::new(),
-                [one] => shown(one),
+                [value] => shown(value),
                 [first, .., last] => format!("{} to {}", shown(first), shown(last)),
             };
         }
         self.ends(cell).map_or(String::new(), |(from, to)| format!("{} to {}", few(from), few(to)))
     }
 
-    /// The cells that stand for all, at most so many: the first, the last, and some between.
+    /// Selects at most `most` cells: the first, the last, and evenly spaced ones between them.
     pub fn some(&self, most: usize) -> Vec<usize> {
         if self.count <= most {
             return (0..self.count).collect();
@@ -240,23 +240,23 @@ fn at(value: &Parameter) -> f64 {
     value.number().unwrap_or(0.0)
 }
 
-/// Whether two parameters are one: a number may have gone through a text.
-fn same(one: &Parameter, other: &Parameter) -> bool {
-    match (one.number(), other.number()) {
-        (Some(one), Some(other)) => (one - other).abs() <= 1e-12 * one.abs().max(other.abs()),
-        _ => one == other,
+/// Returns true if two parameters are equal, up to the rounding of a conversion to text.
+fn same(a: &Parameter, b: &Parameter) -> bool {
+    match (a.number(), b.number()) {
+        (Some(a), Some(b)) => (a - b).abs() <= 1e-12 * a.abs().max(b.abs()),
+        _ => a == b,
     }
 }
 
-/// A parameter in few letters.
+/// Formats a parameter in few letters.
 pub fn shown(value: &Parameter) -> String {
     match value {
         Parameter::Number(number) if number.is_finite() => few(*number),
-        other => other.to_string(),
+        parameter => parameter.to_string(),
     }
 }
 
-/// Whether drawn values are so few that every one of them was drawn often.
+/// Returns true if there are so few distinct drawn values that they count as a list.
 fn few_values(values: &[Parameter], table: &Table) -> bool {
     values.len() <= WHOLE && (values.len() < 2 || table.rows.len() >= 3 * values.len())
 }

@@ -1,4 +1,4 @@
-//! Pages of small tables: every number on them is a row's, and strange tables make pages too.
+//! Pages of small tables: every number comes from a row, and unusual tables also yield valid pages.
 
 use super::facts::Facts;
 use super::number::few;
@@ -49,7 +49,7 @@ fn table(axes: Vec<Axis>, rows: Vec<Row>) -> Table {
     }
 }
 
-/// Four by three points, two seeds each: accepted below a diagonal, claimed below another.
+/// Four by three points with two seeds each: cases below one diagonal are accepted, below another a rate is claimed.
 fn square() -> Table {
     let axes = vec![
         axis("gain", AxisKind::Linear, numbers(&[1.0, 2.0, 3.0, 4.0])),
@@ -59,7 +59,7 @@ fn square() -> Table {
     for (x, y, seed) in (0..4).flat_map(|x| (0..3).flat_map(move |y| (0..2).map(move |seed| (x, y, seed)))) {
         let parameters = vec![Parameter::Number(f64::from(x + 1)), Parameter::Whole(y.into())];
         let value = 0.01 * f64::from(10 * x + y) + 0.001 * f64::from(seed);
-        // At the corner the seeds differ.
+        // At one corner the seeds have different verdicts.
         let accepted = x + y < 4 || (x == 3 && y == 1 && seed == 0);
         let mut row = row(rows.len() as u64, parameters, Some(value), Some(accepted));
         row.predicted_rate_per_s = (x + y < 2).then_some(1.5);
@@ -71,7 +71,7 @@ fn square() -> Table {
     table(axes, rows)
 }
 
-/// The page of a table, which must be whole whatever is in it.
+/// Returns the page of a table and checks that it is well-formed.
 fn html(table: &Table) -> String {
     let directory = tempfile::tempdir().unwrap();
     let model = model(table, directory.path());
@@ -100,7 +100,7 @@ fn picture<'a, 'i>(document: &'a Document<'i>, label: &str) -> Node<'a, 'i> {
     document.descendants().find(labelled).unwrap_or_else(|| panic!("{label}"))
 }
 
-/// How many pieces a border has.
+/// Returns the number of pieces of a border.
 fn pieces(picture: Node<'_, '_>, label: &str) -> usize {
     let path = picture.descendants().find(|node| node.attribute("data-label") == Some(label)).unwrap();
     path.attribute("d").unwrap().matches('M').count()
@@ -121,11 +121,11 @@ fn a_map_has_a_cell_per_point_and_its_borders_lie_between_them() {
     );
     // Accepted: all but (2, 2) and (3, 2); half of (3, 1). Claimed: (0, 0), (0, 1), (1, 0).
     assert_eq!((pieces(map, "border of acceptance"), pieces(map, "border of the certificate’s claim")), (3, 4));
-    let share = picture(&document, "part accepted: delay over gain");
+    let share = picture(&document, "acceptance: delay over gain");
     assert_eq!(pieces(share, "border of acceptance"), 3);
     assert!(html.contains("19 of 24 cases accepted") && html.contains("Up to 2 cases have the same values"));
-    assert!(html.contains("median of the cases of a cell: sync error (largest once settled), rad/s"));
-    // What is claimed, and what was accepted of that.
+    assert!(html.contains("median per cell: sync error (largest once settled), rad/s"));
+    // Claimed cases and their verdicts.
     let cells = |row: &str| {
         let row = document
             .descendants()
@@ -139,8 +139,9 @@ fn a_map_has_a_cell_per_point_and_its_borders_lie_between_them() {
             .map(str::to_owned)
             .collect::<Vec<_>>()
     };
-    assert_eq!((cells("a rate is claimed").len(), cells("none is").len()), (3, 3), "{:?}", cells("none is"));
-    assert_eq!((cells("a rate is claimed")[0].as_str(), cells("none is")[1].as_str()), ("6", "5"));
+    let (claimed, unclaimed) = (cells("a rate is claimed"), cells("no rate is claimed"));
+    assert_eq!((claimed.len(), unclaimed.len()), (3, 3), "{unclaimed:?}");
+    assert_eq!((claimed[0].as_str(), unclaimed[1].as_str()), ("6", "5"));
 }
 
 #[test]
@@ -149,8 +150,8 @@ fn the_worst_case_is_first_and_every_command_names_its_case() {
     let accept = "[scenario.accept]\nsync_error_rad_s_max = 1\nsync_error_rad_s_peak = 0.5\n";
     std::fs::write(directory.path().join("campaign.toml"), accept).unwrap();
     let table = square();
-    let facts = Facts::of(&table, directory.path());
-    // The peak is beyond its limit in every case.
+    let facts = Facts::new(&table, directory.path());
+    // The peak exceeds its limit in every case.
     assert_eq!((facts.metric, facts.limit), (Some(2), Some(0.5)));
     assert!(
         facts.command(3).starts_with("corotate run '/")
@@ -161,10 +162,10 @@ fn the_worst_case_is_first_and_every_command_names_its_case() {
     let cases: Vec<&str> = rows.iter().map(|row| row[0].as_str()).collect();
     assert_eq!((cases.len(), &cases[..4]), (10, &["23", "16", "17", "21"][..]), "lost, then not accepted");
     assert!(rows.iter().all(|row| row[1] == format!("`{}`", facts.command(row[0].parse().unwrap()))));
-    // Where what is accepted is varied too, there is no one limit.
+    // If the limit itself is varied, there is no common limit.
     let mut varied = square();
     varied.axes[0].key = "accept.sync_error_rad_s_max".to_owned();
-    let facts = Facts::of(&varied, directory.path());
+    let facts = Facts::new(&varied, directory.path());
     assert_eq!((facts.metric, facts.limit), (Some(1), None));
 }
 
@@ -174,21 +175,22 @@ fn quantiles_are_values_that_some_case_has() {
     let quantiles = [0.05, 0.25, 0.5, 0.75, 0.95].map(|part| quantile(&sorted, part));
     assert_eq!(quantiles, [1.0, 1.0, 2.0, 3.0, f64::INFINITY].map(Some));
     assert_eq!((quantile(&[], 0.5), quantile(&[4.0], 0.0)), (None, Some(4.0)));
-    let told = [0.0, 1.5, 0.01234, 123.46, 2.5e-7, 1e-9, -3.25, 1e6].map(few);
-    assert_eq!(told, ["0", "1.5", "0.0123", "123.5", "2.5e-7", "1e-9", "-3.25", "1e6"]);
+    let formatted = [0.0, 1.5, 0.01234, 123.46, 2.5e-7, 1e-9, -3.25, 1e6].map(few);
+    assert_eq!(formatted, ["0", "1.5", "0.0123", "123.5", "2.5e-7", "1e-9", "-3.25", "1e6"]);
 }
 
 #[test]
 fn any_table_makes_a_page() {
     let word = |text: &str| Parameter::Word(text.to_owned());
-    let one = |parameters: Vec<Parameter>, axes| table(axes, vec![row(0, parameters, Some(1e-7), Some(true))]);
-    let nothing = Table { cases: 9, ..table(vec![axis("a", AxisKind::Linear, numbers(&[1.0, 2.0]))], Vec::new()) };
-    let text = html(&nothing);
-    assert!(text.contains("no case has been run") && text.contains("9 of 9 cases have not been run"));
-    let single = one(vec![Parameter::Flag(true)], vec![axis("a", AxisKind::Values, vec![Parameter::Flag(true)])]);
+    let single_case = |parameters: Vec<Parameter>, axes| table(axes, vec![row(0, parameters, Some(1e-7), Some(true))]);
+    let empty = Table { cases: 9, ..table(vec![axis("a", AxisKind::Linear, numbers(&[1.0, 2.0]))], Vec::new()) };
+    let text = html(&empty);
+    assert!(text.contains("no case has been run") && text.contains("9 of 9 cases are missing"));
+    let single =
+        single_case(vec![Parameter::Flag(true)], vec![axis("a", AxisKind::Values, vec![Parameter::Flag(true)])]);
     assert!(html(&single).contains("all 1 cases accepted"));
-    assert!(html(&one(Vec::new(), Vec::new())).contains("distribution of the metric"));
-    // Words and flags, which are no markup.
+    assert!(html(&single_case(Vec::new(), Vec::new())).contains("distribution of the metric"));
+    // Words and flags, with characters of markup.
     let axes = vec![
         axis("<filter>", AxisKind::Values, vec![word("first & \"second\" order of a filter"), word("</svg>")]),
         axis("guard", AxisKind::Values, vec![Parameter::Flag(true), Parameter::Flag(false)]),
@@ -199,7 +201,7 @@ fn any_table_makes_a_page() {
     });
     let words = html(&table(axes.clone(), rows.collect()));
     assert!(words.contains("map: guard over &lt;filter&gt;") && words.contains("no value"));
-    // Nothing has a number, all was lost, all is one number, nothing ran.
+    // No case has a value, all bodies are lost, all values are equal, no case ran.
     for (value, end) in [(None, End::Completed), (None, End::Lost), (Some(0.0), End::Completed), (None, End::Invalid)] {
         let mut table = square();
         for row in &mut table.rows {
@@ -212,12 +214,12 @@ fn any_table_makes_a_page() {
         assert_eq!(html.contains("is &lt;too&gt; long"), end == End::Invalid);
         assert_eq!(html.contains("body lost"), end == End::Lost);
     }
-    // Fewer values in a row than there are axes.
-    html(&one(Vec::new(), axes));
+    // A row with fewer values than axes.
+    html(&single_case(Vec::new(), axes));
 }
 
 #[test]
-fn drawn_axes_are_points_and_of_many_cases_maps() {
+fn drawn_axes_are_points_or_for_many_cases_maps() {
     let drawn = |cases: u64| {
         let axes = ["a", "b", "c"].map(|key| axis(key, AxisKind::Linear, Vec::new())).to_vec();
         let part = |case: u64, prime: u64| ((case * prime) % 4999) as f64 / 4999.0;
@@ -239,13 +241,15 @@ fn drawn_axes_are_points_and_of_many_cases_maps() {
     );
     let many = html(&drawn(4999));
     assert!(
-        many.contains("map: b over a") && !many.contains("cases: b over a") && many.contains("maps: b over a, apart")
+        many.contains("map: b over a")
+            && !many.contains("cases: b over a")
+            && many.contains("maps: b over a, separate")
     );
     assert!(few.len().max(many.len()) < 2 << 20, "{} {}", few.len(), many.len());
 }
 
 #[test]
-fn margins_are_told_with_their_brackets_and_what_is_beyond_the_range() {
+fn margins_show_their_brackets_and_whether_they_exceed_the_range() {
     let mut table = square();
     let point = |case: u64, gain: f64, value: Option<f64>, bracket| MarginPoint {
         case,
@@ -281,5 +285,5 @@ fn margins_are_told_with_their_brackets_and_what_is_beyond_the_range() {
         plot.descendants().filter(|node| node.attribute("class").is_some_and(|class| class.starts_with("arrow")));
     assert_eq!(arrows.count(), 2);
     table.margins[0].points.clear();
-    assert!(self::html(&table).contains("No point of it has been searched yet."));
+    assert!(self::html(&table).contains("No point has been searched yet."));
 }
