@@ -11,8 +11,14 @@ use comfy_table::{CellAlignment, Table};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
-/// The summary as text for people, at most 100 columns wide.
-pub fn table(summary: &Summary) -> String {
+/// Rows of results that are shown unless all are asked for: with the rest they fit on a screen of 24 lines.
+const RESULT_ROWS: usize = 8;
+/// Incidents that are shown unless all are asked for.
+const INCIDENTS: usize = 4;
+
+/// Returns the summary as text: results, latencies of estimate and control, counters, on a screen of 24 lines of 80 columns unless
+/// there are incidents or notes. `all` adds every stage, link, watchdog and privilege, up to 100 columns wide.
+pub fn table(summary: &Summary, all: bool) -> String {
     let mut text = String::new();
     let seconds = summary.last_tick as f64 / summary.tick_hz;
     let _ = writeln!(
@@ -25,27 +31,34 @@ pub fn table(summary: &Summary) -> String {
     );
     let mut processes = BTreeMap::<&str, Vec<&str>>::new();
     summary.hosted.iter().for_each(|(role, host)| processes.entry(host).or_default().push(role));
-    for (host, roles) in processes {
+    for (host, roles) in processes.into_iter().filter(|_| all) {
         let _ = writeln!(text, "one process: {}, {host}", roles.join(", "));
     }
     for note in &summary.notes {
         let _ = writeln!(text, "note: {note}");
     }
-    results(summary, &mut text);
-    for incident in &summary.incidents {
+    results(summary, all, &mut text);
+    let shown = if all { usize::MAX } else { INCIDENTS };
+    text.push_str(if summary.incidents.is_empty() { "" } else { "\n" });
+    for incident in summary.incidents.iter().take(shown) {
         let _ = writeln!(text, "{incident}{}", times(incident));
     }
+    if summary.incidents.len() > shown {
+        let _ = writeln!(text, "{} more incidents: -v shows them", summary.incidents.len() - shown);
+    }
     if !summary.latencies.is_empty() {
-        let _ = writeln!(text, "\n{}", latencies(summary));
+        let _ = writeln!(text, "\n{}", if all { latencies(summary) } else { critical_latencies(summary) });
     }
-    books(summary, &mut text);
-    watchdog(summary, &mut text);
-    for (body, counters) in &summary.lines {
-        let _ = writeln!(text, "{}", line_words(body, counters));
+    counters(summary, all, &mut text);
+    watchdog(summary, all, &mut text);
+    if all {
+        for (body, counters) in &summary.lines {
+            let _ = writeln!(text, "{}", line_words(body, counters));
+        }
+        summary.hosts.iter().for_each(|summary| hosts(summary, &mut text));
     }
-    summary.hosts.iter().for_each(|of| hosts(of, &mut text));
-    privileges(summary, &mut text);
-    text
+    privileges(summary, all, &mut text);
+    text.lines().flat_map(|line| [line.trim_end(), "\n"]).collect()
 }
 
 /// The counters of a serial line in words, one line for what went well and one for what did not.
@@ -81,27 +94,45 @@ pub fn line_words(body: &str, counters: &LineCounters) -> String {
     if ill.is_empty() { format!("{well}; no fault") } else { format!("{well}\n  {}", ill.join(", ")) }
 }
 
-fn results(summary: &Summary, text: &mut String) {
-    let mut rows = plain(&["result", "at the end", "settled max", "limit", "within from", "verdict"]);
+fn results(summary: &Summary, all: bool, text: &mut String) {
+    let dash = || "-".to_owned();
+    let mut rows = Vec::new();
     for metric in &summary.score.metrics {
         let criterion = summary.criteria.iter().find(|criterion| criterion.name == format!("{}_max", metric.name));
-        rows.add_row([
+        let holds = criterion.and_then(|criterion| criterion.holds);
+        let row = [
             metric.name.clone(),
-            if metric.last.is_nan() { "-".to_owned() } else { format!("{:.2e}", metric.last) },
-            metric.settled_max.map_or("-".to_owned(), |value| format!("{value:.2e}")),
-            criterion.map_or("-".to_owned(), |criterion| exact(criterion.limit)),
-            metric.settled_at_s.map_or("-".to_owned(), |time| format!("{} s", digits(time))),
-            verdict(criterion.and_then(|criterion| criterion.holds)),
-        ]);
+            if metric.last.is_nan() { dash() } else { format!("{:.2e}", metric.last) },
+            metric.settled_max.map_or_else(dash, |value| format!("{value:.2e}")),
+            criterion.map_or_else(dash, |criterion| exact(criterion.limit)),
+            metric.settled_at_s.map_or_else(dash, |time| format!("{} s", digits(time))),
+            verdict(holds),
+        ];
+        rows.push((holds, row));
     }
     let of_metric = |name: &str| summary.score.metrics.iter().any(|metric| name == format!("{}_max", metric.name));
     for criterion in summary.criteria.iter().filter(|criterion| !of_metric(&criterion.name)) {
         let value = criterion.value.map_or("not measured".to_owned(), short);
         let limit = exact(criterion.limit);
-        let dash = || "-".to_owned();
-        rows.add_row([criterion.label(), value, dash(), limit, dash(), verdict(criterion.holds)]);
+        rows.push((criterion.holds, [criterion.label(), value, dash(), limit, dash(), verdict(criterion.holds)]));
     }
-    let _ = writeln!(text, "\n{rows}\n\n{}", summary.verdict);
+    let hidden = if all { 0 } else { rows.len().saturating_sub(RESULT_ROWS) };
+    if hidden > 0 {
+        // Failures first, then what is not judged.
+        rows.sort_by_key(|(holds, _)| *holds == Some(true));
+        rows.sort_by_key(|(holds, _)| *holds != Some(false));
+    }
+    let mut table = plain(&["result", "at the end", "settled max", "limit", "since", "verdict"]);
+    rows.iter().take(rows.len() - hidden).for_each(|(_, row)| _ = table.add_row(row));
+    let _ = writeln!(text, "\n{table}");
+    if hidden > 0 {
+        let failing = rows[RESULT_ROWS..].iter().filter(|(holds, _)| *holds == Some(false)).count();
+        let _ = writeln!(text, "{hidden} more results, {failing} of them FAIL: -v shows them");
+    }
+    if !all {
+        return;
+    }
+    text.push('\n');
     for criterion in &summary.criteria {
         if let Some(reason) = &criterion.reason {
             let _ = writeln!(text, "{} is not judged: {reason}", criterion.name);
@@ -109,24 +140,25 @@ fn results(summary: &Summary, text: &mut String) {
     }
     if let Some(score) = summary.score.certificate {
         let (held, broken, judged) = (score.held, score.broken, score.held + score.broken);
-        let told = match broken {
+        let kept = match broken {
             0 => format!("held at all of {judged} steps"),
             _ => format!("broken at {broken} of {judged} steps, held at {held}"),
         };
-        let _ = writeln!(text, "\nbound on dV/dt {told}, {} not judged", score.unjudged);
+        let _ = writeln!(text, "bound on dV/dt {kept}, {} not judged", score.unjudged);
     }
-    for (signal, told) in &summary.score.statuses {
-        let told: Vec<String> = told.iter().map(|(name, ticks)| format!("{name} at {ticks}")).collect();
-        let _ = writeln!(text, "{signal}: {} of {} ticks", told.join(", "), summary.last_tick + 1);
+    for (signal, statuses) in &summary.score.statuses {
+        let statuses: Vec<String> = statuses.iter().map(|(name, ticks)| format!("{name} at {ticks}")).collect();
+        let _ = writeln!(text, "{signal}: {} of {} ticks", statuses.join(", "), summary.last_tick + 1);
     }
 }
 
-fn watchdog(summary: &Summary, text: &mut String) {
+fn watchdog(summary: &Summary, all: bool, text: &mut String) {
     let Some(report) = &summary.watchdog else { return };
-    for one in &report.watched {
-        let largest = one.largest.map_or("beyond every number".to_owned(), |largest| format!("{largest:.2e}"));
-        let _ = write!(text, "watchdog, {}: {} of {} beyond {:e}", one.quantity, one.breaches, one.judged, one.max);
-        let first = one.first_tick.map_or(String::new(), |tick| format!(", first at tick {tick}"));
+    for watched in report.watched.iter().filter(|watched| all || watched.breaches > 0) {
+        let largest = watched.largest.map_or("beyond every number".to_owned(), |largest| format!("{largest:.2e}"));
+        let (breaches, judged, max) = (watched.breaches, watched.judged, watched.max);
+        let _ = write!(text, "watchdog, {}: {breaches} of {judged} beyond {max:e}", watched.quantity);
+        let first = watched.first_tick.map_or(String::new(), |tick| format!(", first at tick {tick}"));
         let _ = writeln!(text, ", largest {largest}{first}");
     }
     if let Some(tick) = report.latched_at_tick {
@@ -147,6 +179,21 @@ fn verdict(holds: Option<bool>) -> String {
         None => "-",
     }
     .to_owned()
+}
+
+/// The latencies of estimate and control, and the latest role at its tick, as a table.
+fn critical_latencies(summary: &Summary) -> String {
+    let find = |role: &str, stage: &str| summary.latencies.iter().find(|row| row.role == role && row.stage == stage);
+    let lateness = summary.latencies.iter().filter(|row| row.stage == "lateness");
+    let latest = lateness.max_by(|one, other| one.figures.p99_us.total_cmp(&other.figures.p99_us));
+    let stages =
+        [("observer", "step"), ("controller", "step"), ("controller", "age")].map(|(role, stage)| find(role, stage));
+    let mut rows = plain(&["latency, us", "p50", "p99", "p99.9", "max"]);
+    for row in stages.into_iter().chain([latest]).flatten() {
+        let figures = [row.figures.p50_us, row.figures.p99_us, row.figures.p999_us, row.figures.max_us];
+        rows.add_row([format!("{} {}", row.role, row.stage)].into_iter().chain(figures.map(us)));
+    }
+    rows.to_string()
 }
 
 fn latencies(summary: &Summary) -> String {
@@ -178,12 +225,12 @@ fn us(us: f64) -> String {
     if us.is_nan() { "-".to_owned() } else { format!("{us:.2}") }
 }
 
-fn books(summary: &Summary, text: &mut String) {
+fn counters(summary: &Summary, all: bool, text: &mut String) {
     let (books, state) = (&summary.books, &summary.state);
     let executed: u64 = books.roles.values().map(|ticks| ticks.executed).sum();
     let _ = writeln!(
         text,
-        "\ncounters {}: {executed} ticks executed by {} roles, {} missed or starved; {} of {} ticks scored",
+        "\ncounters {}: {} roles, {executed} ticks, {} missed or starved, {} of {} scored",
         if books.balanced { "balance" } else { "DO NOT BALANCE" },
         books.roles.len(),
         books.missed_ticks,
@@ -198,7 +245,7 @@ fn books(summary: &Summary, text: &mut String) {
         let _ = writeln!(text, "{} samples rejected by their readers{reasons}", books.rejected_samples);
     }
     let met = |link: &&LinkCounters| link.published.is_none() || link.rejected + link.stale + link.void.1 > 0;
-    for link in books.links.iter().filter(met) {
+    for link in books.links.iter().filter(met).filter(|_| all) {
         let LinkCounters { service, reader, received, rejected, stale, void, .. } = link;
         let _ = write!(
             text,
@@ -223,11 +270,9 @@ fn books(summary: &Summary, text: &mut String) {
                 State::undisturbed_words(state.elapsed_ticks, summary.last_tick + 1, !books.unbooked.is_empty());
             writeln!(text, "state hash {} ({words})", state.hash)
         }
-        Some(tick) => writeln!(
-            text,
-            "state hash {}; first disturbed tick {tick}, hash of the first {} ticks {}",
-            state.hash, state.clean_ticks, state.clean_hash
-        ),
+        Some(tick) => {
+            writeln!(text, "state hash {}; {} before the disturbed tick {tick}", state.hash, state.clean_hash)
+        }
     };
 }
 
@@ -298,11 +343,12 @@ fn hosts(summary: &HostsSummary, text: &mut String) {
     let _ = writeln!(text, "times between hosts are known to {error_us:.1} us\n");
 }
 
-fn privileges(summary: &Summary, text: &mut String) {
-    if summary.privileges.is_empty() {
+fn privileges(summary: &Summary, all: bool, text: &mut String) {
+    let granted = summary.privileges.iter().filter(|entry| entry.grant.granted).count();
+    let everything = granted == summary.privileges.len() && summary.privileges_unknown.is_empty();
+    if summary.privileges.is_empty() || everything && !all {
         return;
     }
-    let granted = summary.privileges.iter().filter(|entry| entry.grant.granted).count();
     let unknown = match summary.privileges_unknown.join(", ") {
         names if names.is_empty() => names,
         names => format!("; unknown of {names}: no report of any"),
@@ -321,6 +367,9 @@ fn privileges(summary: &Summary, text: &mut String) {
 pub(crate) fn plain(header: &[&str]) -> Table {
     let mut table = Table::new();
     table.load_style(NOTHING).set_header(header);
+    if let Some(first) = table.column_mut(0) {
+        first.set_padding((0, 1));
+    }
     for column in table.column_iter_mut().skip(1) {
         column.set_cell_alignment(CellAlignment::Right);
     }

@@ -90,7 +90,7 @@ pub struct Arguments {
     /// Print nothing but errors and the last line
     #[arg(short, long, conflicts_with = "verbose")]
     quiet: bool,
-    /// Tell on stderr where the run is, and its phases
+    /// Print the whole table, and on stderr the phases
     #[arg(short, long)]
     verbose: bool,
 }
@@ -340,8 +340,11 @@ fn tell_ungranted(scenario: &Scenario) {
 }
 
 fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<(), Failure> {
-    let text =
-        if arguments.quiet { String::new() } else { format!("{}results in {}\n", table(summary), directory.display()) };
+    let text = if arguments.quiet {
+        String::new()
+    } else {
+        format!("{}results in {}\n", table(summary, arguments.verbose), directory.display())
+    };
     if arguments.events {
         text.lines().for_each(tell);
         for incident in &summary.incidents {

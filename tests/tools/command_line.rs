@@ -168,6 +168,30 @@ fn an_option_that_makes_no_sense_is_named_as_it_was_typed() {
     }
 }
 
+/// Notes and privileges that are not granted come on top.
+#[test]
+fn the_table_of_a_run_fits_on_a_screen_and_all_of_it_is_behind_an_option() {
+    let bench = Bench::new();
+    for scenario in
+        ["rigid-pair", "rigid-trio", "rigid-fleet", "orbit-hold", "orbit-rendezvous", "gyro-loss", "inertia"]
+    {
+        let run = ["run", scenario, "--duration", "1", "--set", "accept.settled_by_s=0.5"];
+        let short = bench.run(&[&run[..], &["--out", &format!("{scenario}-short")]].concat());
+        let table: Vec<&str> = short
+            .stdout
+            .lines()
+            .filter(|line| !["note: ", "privileges: ", "  no "].iter().any(|more| line.starts_with(more)))
+            .collect();
+        assert!((8..=24).contains(&table.len()), "{short:?}");
+        let wide = table.iter().filter(|line| line.chars().count() > 80 && !line.starts_with("FAIL: "));
+        assert_eq!(wide.count(), 0, "{}", short.stdout);
+        assert!(short.stdout.contains("observer step") && !short.stdout.contains("baseline"), "{short:?}");
+        let long = bench.run(&[&run[..], &["-v", "--out", &format!("{scenario}-long")]].concat());
+        assert!(long.stdout.contains("baseline") && long.stdout.lines().count() > table.len(), "{long:?}");
+    }
+    bench.assert_clean(&[]);
+}
+
 /// Of a run that was judged well, of one that was not, and of one that was not judged: in its last line, by its exit code.
 #[test]
 fn the_last_line_is_the_verdict() {
