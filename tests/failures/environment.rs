@@ -1,5 +1,5 @@
-//! A machine that is short of everything: memory, descriptors, disk, time, cores. A run says what it lacks or counts what it
-//! lost; it never hangs, never panics, and leaves nothing behind.
+//! A machine that lacks memory, descriptors, disk, time or cores. A run reports what it lacks or counts what it lost;
+//! it never hangs, never panics, and leaves nothing behind.
 
 use crate::common::{Bench, Done, Running, await_some, send_signal, shipped};
 use libc::{SIGCONT, SIGSTOP};
@@ -8,10 +8,10 @@ use std::process::Command;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-/// For tests that need their processes to be served, or that keep others from it: one at a time.
+/// Held by tests that need an idle machine or keep it busy: one at a time.
 static CORES: Mutex<()> = Mutex::new(());
 
-/// A shell that runs a line in the bench.
+/// Starts a shell that runs a line in the bench.
 fn start_in_shell(bench: &Bench, line: &str) -> Running {
     let mut shell = Command::new("/bin/sh");
     let like = bench.command();
@@ -22,22 +22,22 @@ fn start_in_shell(bench: &Bench, line: &str) -> Running {
     Running::new(&mut shell)
 }
 
-/// The line of a run of half a second.
+/// Returns the shell line of a run of half a second.
 fn short_run(clock: &str) -> String {
     let (program, file) = (env!("CARGO_BIN_EXE_corotate"), shipped("rigid-pair"));
     format!("exec {program} run {} --clock {clock} --set accept={{}} --duration 0.5 --out out", file.display())
 }
 
-/// Ended by its own decision, with a reason if it is not well.
+/// Asserts that the program ended by itself, with a reason if it failed.
 fn assert_in_order(done: &Done, case: &str) {
     assert!(matches!(done.code, Some(0 | 1 | 4)), "{case}: {done:?}");
     assert!(!done.stderr.contains("panicked"), "{case}: {done:?}");
-    assert!(done.code == Some(0) || done.stderr.contains("corotate: "), "{case}: it did not say why: {done:?}");
+    assert!(done.code == Some(0) || done.stderr.contains("corotate: "), "{case}: no reason given: {done:?}");
 }
 
 #[test]
-fn too_little_shared_memory_is_told_before_anything_dies_of_it() {
-    // In a mount namespace of its own; as another user in a user namespace, which the kernel must allow.
+fn too_little_shared_memory_is_refused_before_the_run() {
+    // In its own mount namespace; without root in a user namespace, which the kernel must allow.
     let root = rustix::process::getuid().is_root();
     let unshare = if root { "unshare -m" } else { "unshare -rm" };
     let inside = |size: &str, clock: &str| {
@@ -53,7 +53,7 @@ fn too_little_shared_memory_is_told_before_anything_dies_of_it() {
             assert_eq!(done.code, Some(1), "{clock} {size}: {done:?}");
             assert!(done.stderr.contains("/dev/shm"), "{clock} {size}: {done:?}");
         }
-        // Near what is needed it is refused or it runs, and nothing in between.
+        // Near the requirement the run is refused or succeeds.
         for size in ["1500k", "1800k", "2m", "3m"] {
             let done = inside(size, clock);
             assert!(matches!(done.code, Some(0 | 1)), "{clock} {size}: {done:?}");
@@ -64,9 +64,9 @@ fn too_little_shared_memory_is_told_before_anything_dies_of_it() {
     }
 }
 
-/// Found out later, a file that lacks an inode or its size is left half made, and others wait for it.
+/// Without this check, a file without inode or size stays half made, and other processes wait for it.
 #[test]
-fn too_few_inodes_are_told_before_anything_is_half_made() {
+fn too_few_inodes_are_refused_before_the_run() {
     let root = rustix::process::getuid().is_root();
     let unshare = if root { "unshare -m" } else { "unshare -rm" };
     for (inodes, codes) in [(8, [1, 1]), (48, [1, 1]), (150, [0, 1]), (1000, [0, 0])] {
@@ -80,9 +80,10 @@ fn too_few_inodes_are_told_before_anything_is_half_made() {
     }
 }
 
-/// The disk is full for one file of the launcher's: the run says so, or does without; it never waits for the file.
+/// The disk is full for one file of the launcher: the run fails with a reason or does without the file; it never waits
+/// for it.
 #[test]
-fn no_room_for_one_file_of_the_launcher_hangs_nobody() {
+fn a_full_disk_for_one_file_of_the_launcher_causes_no_hang() {
     for n in [1, 2, 3, 5, 8, 11, 14] {
         let bench = Bench::new();
         let inject = format!("strace -qq -o /dev/null -e trace=ftruncate -e inject=ftruncate:error=ENOSPC:when={n}");
@@ -95,7 +96,7 @@ fn no_room_for_one_file_of_the_launcher_hangs_nobody() {
 }
 
 #[test]
-fn a_limit_on_descriptors_is_an_error_and_not_the_end_of_the_world() {
+fn a_limit_on_descriptors_is_reported_as_an_error() {
     for limit in [4, 8, 12, 16, 20, 24, 32, 48, 64, 128] {
         let bench = Bench::new();
         let done = start_in_shell(&bench, &format!("ulimit -n {limit}; {}", short_run("lockstep"))).wait();
@@ -104,14 +105,14 @@ fn a_limit_on_descriptors_is_an_error_and_not_the_end_of_the_world() {
     }
 }
 
-/// A full disk and a vanished directory: the run's results cannot be written, but they are still on the screen.
+/// A full disk or a removed directory: the results cannot be written, but the screen shows them.
 #[test]
-fn results_that_cannot_be_written_are_told_and_still_shown() {
+fn results_that_cannot_be_written_are_reported_and_still_shown() {
     for file in ["summary.json", "scenario.toml", "hashes.txt"] {
         let bench = Bench::new();
         let run = shipped("rigid-pair");
         let running = bench.start(&["run", run.to_str().unwrap(), "--duration=2", "--set=accept={}", "--out=out"]);
-        // Before that, the directory would be refused: it would hold a file that is not ours.
+        // Earlier the directory would be refused because of a foreign file.
         bench.await_role("follower");
         symlink("/dev/full", bench.path("out").join(file)).unwrap();
         let done = running.wait();
@@ -139,7 +140,7 @@ fn results_that_cannot_be_written_are_told_and_still_shown() {
 
 #[test]
 fn a_directory_that_may_not_be_written_is_refused_before_the_run() {
-    // Root may write everywhere: this is for everybody else.
+    // Root may write everywhere: this test is for other users.
     let bench = Bench::unprivileged();
     std::fs::create_dir(bench.path("locked")).unwrap();
     std::fs::set_permissions(bench.path("locked"), std::fs::Permissions::from_mode(0o555)).unwrap();
@@ -150,9 +151,9 @@ fn a_directory_that_may_not_be_written_is_refused_before_the_run() {
     assert!(done.stderr.contains("locked/out") && done.stderr.contains("--out"), "{done:?}");
 }
 
-/// As a host does to a virtual machine: everything stands still for two seconds, and the clock has gone on.
+/// As when a host pauses a virtual machine: all processes stop for two seconds while the clock continues.
 #[test]
-fn two_lost_seconds_are_counted_and_nobody_is_blamed() {
+fn a_pause_of_two_seconds_is_counted_without_incidents() {
     let _cores = CORES.lock().unwrap_or_else(PoisonError::into_inner);
     let bench = Bench::new();
     let file = shipped("rigid-pair");
@@ -169,16 +170,16 @@ fn two_lost_seconds_are_counted_and_nobody_is_blamed() {
     assert_eq!(summary["books"]["balanced"], true, "{:#}", summary["books"]);
     for role in ["leader", "follower"] {
         let missed = summary["books"]["roles"][role]["missed"].as_u64().unwrap();
-        assert!(missed > 1900, "{role} missed {missed}: this test is about more");
+        assert!(missed > 1900, "{role} missed {missed}: too few for this test");
     }
     let sync = summary["score"]["metrics"][0]["last"].as_f64().unwrap();
     assert!(sync < 2.0, "the follower is bounded: {sync}");
     bench.assert_clean(&[]);
 }
 
-/// A role that stands still for less than the limit is waited for: the plant's own expiry covers the gap.
+/// A role that stops for less than the limit is not replaced: the plant's command timeout covers the gap.
 #[test]
-fn a_short_standstill_is_bridged_by_the_plant_s_expiry() {
+fn a_short_stop_is_covered_by_the_command_timeout() {
     let _cores = CORES.lock().unwrap_or_else(PoisonError::into_inner);
     let bench = Bench::new();
     let file = shipped("rigid-pair");
@@ -197,9 +198,9 @@ fn a_short_standstill_is_bridged_by_the_plant_s_expiry() {
     bench.assert_clean(&[]);
 }
 
-/// A neighbour of higher priority takes one core for more than a second.
+/// A process of higher priority occupies one core for more than a second.
 #[test]
-fn a_core_that_is_lost_to_a_busy_neighbour_costs_ticks_and_nothing_else() {
+fn a_busy_core_costs_only_ticks() {
     let _cores = CORES.lock().unwrap_or_else(PoisonError::into_inner);
     let bench = Bench::new();
     let file = shipped("rigid-pair");
@@ -208,7 +209,7 @@ fn a_core_that_is_lost_to_a_busy_neighbour_costs_ticks_and_nothing_else() {
     bench.await_ticks("controller");
     let core = std::thread::available_parallelism().unwrap().get() - 1;
     let priority = if rustix::process::getuid().is_root() { "chrt -f 90" } else { "nice -n 0" };
-    // The one that ends it must not be behind it.
+    // The process that ends it must have at least its priority.
     let hog = format!("timeout -s KILL 1.2 {priority} taskset -c {core} sh -c 'while :; do :; done'");
     let mut hog = Command::new("/bin/sh").args(["-c", &hog]).spawn().unwrap();
     let done = running.wait();

@@ -1,5 +1,5 @@
-//! Scripted faults: no single one moves a follower outside the declared bound, every one is counted somewhere, the books
-//! balance, the loop converges again; and the clocks agree on all of it.
+//! Scripted faults: no single fault moves a follower outside the declared bound, every fault is counted, the counters
+//! balance, the loop converges again, and all clocks agree.
 
 use crate::common::{Bench, shipped};
 use corotate::launch::{Launch, Summary, run};
@@ -11,15 +11,15 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::SystemTime;
 
-/// The declared bound: that of `faults.toml`, rad/s.
+/// The declared bound of `faults.toml`, rad/s.
 const BOUND_RAD_S: f64 = 0.1;
-/// A fault that nobody noticed has moved nobody further than this, rad/s: where V of the watchdog's bound begins.
+/// Largest effect of a fault that no counter shows, rad/s: V at the watchdog's bound.
 const HARMLESS_RAD_S: f64 = 0.01;
-/// What the loop has converged to at the end, rad/s.
+/// The final synchronisation error of a settled loop, rad/s.
 const SETTLED_RAD_S: f64 = 1e-6;
-/// When the faults of the matrix begin: at two places of the leader's motion.
+/// First ticks of the faults in the matrix: two phases of the leader's motion.
 const FROM_TICKS: [u64; 2] = [200, 1777];
-/// A loop that is settled from the first tick on, so that whatever moves was moved by a fault.
+/// A loop that is settled from the first tick on, so that every deviation comes from a fault.
 const SETTLED: [&str; 6] = [
     "clock=in-process",
     "duration_s=7",
@@ -29,13 +29,13 @@ const SETTLED: [&str; 6] = [
     "observer.initial_guess_rad_s=0.8",
 ];
 
-/// `faults.toml` with other faults than its own.
+/// Returns `faults.toml` with these faults instead.
 fn text(faults: &str) -> String {
     let text = std::fs::read_to_string(shipped("faults")).unwrap();
     text.split("\n# Every fault").next().unwrap().to_owned() + "\n" + faults
 }
 
-/// What one disturbed run came to.
+/// The result of one disturbed run.
 struct Disturbed {
     peak: f64,
     last: f64,
@@ -52,7 +52,7 @@ impl Disturbed {
         Self { peak: number("peak"), last: number("last"), summary }
     }
 
-    fn of(fault: &str, overrides: &[&str]) -> Self {
+    fn with_fault(fault: &str, overrides: &[&str]) -> Self {
         let overrides: Vec<String> = overrides.iter().map(|set| (*set).to_owned()).collect();
         Self::run(
             &Scenario::parse(&text(fault), "matrix", &overrides).unwrap_or_else(|error| panic!("{fault}: {error}")),
@@ -63,15 +63,15 @@ impl Disturbed {
         self.summary["books"][counter].as_u64().unwrap()
     }
 
-    /// Whether any counter but that of the injection itself says that something was wrong.
-    fn noticed(&self) -> bool {
+    /// Returns true if any counter except that of injected faults shows a problem.
+    fn is_counted(&self) -> bool {
         let links = self.summary["books"]["links"].as_array().unwrap();
-        let of_link = |link: &Value| link["stale"].as_u64().unwrap() + link["void"][1].as_u64().unwrap();
+        let problems = |link: &Value| link["stale"].as_u64().unwrap() + link["void"][1].as_u64().unwrap();
         let breaches = self.summary["watchdog"]["watched"].as_array().unwrap().iter();
         self.count("rejected_samples")
             + self.count("missed_ticks")
-            + links.iter().map(of_link).sum::<u64>()
-            + breaches.map(|one| one["breaches"].as_u64().unwrap()).sum::<u64>()
+            + links.iter().map(problems).sum::<u64>()
+            + breaches.map(|watched| watched["breaches"].as_u64().unwrap()).sum::<u64>()
             > 0
     }
 }
@@ -80,7 +80,7 @@ fn fault(kind: &str, role: &str, from_tick: u64, ticks: u64, further: &str) -> S
     format!("[[fault]]\nkind = \"{kind}\"\nrole = \"{role}\"\nfrom_tick = {from_tick}\nticks = {ticks}\n{further}\n")
 }
 
-/// What each role sends: fields and their components.
+/// Returns the fields that a role sends, with their number of components.
 fn fields(role: &str) -> &'static [(&'static str, usize)] {
     match role {
         "observer" => &[
@@ -108,7 +108,7 @@ fn fields(role: &str) -> &'static [(&'static str, usize)] {
 
 const ROLES: [&str; 4] = ["leader", "follower", "observer", "controller"];
 
-/// Every bit of everything that is sent.
+/// Returns a fault for every bit of every sent field.
 fn flips() -> Vec<String> {
     let mut faults = Vec::new();
     for role in ROLES {
@@ -122,8 +122,8 @@ fn flips() -> Vec<String> {
     faults
 }
 
-/// Every other kind, on every role where it makes sense, for a tick to a second.
-fn others() -> Vec<String> {
+/// Returns faults of every other kind, on every applicable role, for one tick to one second.
+fn other_faults() -> Vec<String> {
     let mut faults = Vec::new();
     for (role, from) in ROLES.into_iter().flat_map(|role| FROM_TICKS.map(|from| (role, from))) {
         for ticks in [1, 5, 20, 200, 1000] {
@@ -149,12 +149,12 @@ fn others() -> Vec<String> {
     faults
 }
 
-/// Runs every fault by itself, on all cores, and hands each result to `judge`.
+/// Runs every fault in a run of its own, on all cores, and passes each result to `judge`.
 fn every(faults: &[String], overrides: &[&str], judge: impl Fn(&str, &Disturbed) + Sync) {
     let (next, worst) = (AtomicUsize::new(0), Mutex::new(BTreeMap::<String, (u64, f64)>::new()));
     let work = || {
         while let Some(fault) = faults.get(next.fetch_add(1, Ordering::Relaxed)) {
-            let done = Disturbed::of(fault, overrides);
+            let done = Disturbed::with_fault(fault, overrides);
             judge(fault, &done);
             let kind = fault.split('"').nth(1).unwrap().to_owned();
             let mut worst = worst.lock().unwrap();
@@ -171,74 +171,74 @@ fn every(faults: &[String], overrides: &[&str], judge: impl Fn(&str, &Disturbed)
     worst.iter().for_each(|(kind, (count, peak))| println!("{kind}: {count} faults, worst excursion {peak:.1e}"));
 }
 
-fn stays_within_the_bound(fault: &str, done: &Disturbed) {
+fn assert_within_the_bound(fault: &str, done: &Disturbed) {
     assert!(done.peak <= BOUND_RAD_S, "{fault}: {:e}", done.peak);
     assert!(done.last < SETTLED_RAD_S, "{fault}: {:e} at the end", done.last);
     assert_eq!(done.summary["books"]["balanced"], true, "{fault}: {}", done.summary["books"]["problems"]);
     assert!(done.count("injected_faults") >= 1, "{fault} did not act");
-    assert!(done.noticed() || done.peak < HARMLESS_RAD_S, "{fault}: {:e}, and nobody noticed", done.peak);
+    assert!(done.is_counted() || done.peak < HARMLESS_RAD_S, "{fault}: {:e}, and no counter shows it", done.peak);
 }
 
 #[test]
-fn no_flip_of_any_bit_moves_the_follower_outside_the_declared_bound() {
+fn no_bit_flip_moves_the_follower_outside_the_declared_bound() {
     let faults = flips();
     assert!(faults.len() > 2500, "{}", faults.len());
-    every(&faults, &SETTLED, stays_within_the_bound);
+    every(&faults, &SETTLED, assert_within_the_bound);
 }
 
 #[test]
 fn no_other_fault_moves_the_follower_outside_the_declared_bound() {
-    every(&others(), &SETTLED, stays_within_the_bound);
+    every(&other_faults(), &SETTLED, assert_within_the_bound);
 }
 
-/// Drawn bits of drawn components, over and over, with several seeds.
+/// Repeated random bit flips in random components, with several seeds.
 #[test]
-fn nor_do_drawn_flips_whatever_the_seed() {
+fn random_bit_flips_do_not_move_the_follower_outside_the_declared_bound() {
     for seed in 1..=8 {
         let seed = format!("seed={seed}");
         let faults = ROLES.map(|role| fault("bit-flip", role, FROM_TICKS[0], 50, "probability = 0.3"));
-        every(&faults, &[&SETTLED[..], &[&seed]].concat(), stays_within_the_bound);
+        every(&faults, &[&SETTLED[..], &[&seed]].concat(), assert_within_the_bound);
     }
 }
 
-/// The bound is one that can be broken: by a command that is wrong for a second and no more than the actuators can do.
+/// The bound can be broken: by a wrong command within the actuators' limits for one second.
 #[test]
-fn what_the_limits_allow_may_break_the_bound_and_the_watchdog_ends_it() {
+fn a_plausible_wrong_command_breaks_the_bound_and_latches_the_watchdog() {
     let push = fault("out-of-range", "controller", FROM_TICKS[0], 1000, "value = 7.9\ncomponent = 1");
-    let done = Disturbed::of(&push, &SETTLED);
+    let done = Disturbed::with_fault(&push, &SETTLED);
     assert!(done.peak > 10.0 * BOUND_RAD_S, "{:e}", done.peak);
     let safe = [&SETTLED[..], &["watchdog.on_breach=safe", "watchdog.latch_after_ticks=3"]].concat();
-    let ended = Disturbed::of(&push, &safe);
+    let ended = Disturbed::with_fault(&push, &safe);
     let latched = ended.summary["watchdog"]["latched_at_tick"].as_u64().unwrap();
     assert!(latched > FROM_TICKS[0] && latched < FROM_TICKS[0] + 50, "{latched}");
     assert!(ended.peak < 0.5 * done.peak, "{:e} {:e}", ended.peak, done.peak);
     assert_eq!(ended.summary["books"]["balanced"], true, "{:#}", ended.summary["books"]);
     let safe_ticks = ended.summary["books"]["roles"]["follower"]["safe"].as_u64().unwrap();
-    assert_eq!(safe_ticks, 7000 - latched - 20, "for good, 20 silent ticks after the latch");
+    assert_eq!(safe_ticks, 7000 - latched - 20, "permanently, 20 ticks after the latch");
 }
 
 #[test]
-fn the_watchdog_counts_what_breaks_the_physics() {
-    let quiet = Disturbed::of("", &SETTLED);
-    for one in quiet.summary["watchdog"]["watched"].as_array().unwrap() {
-        assert_eq!(one["breaches"], 0, "{one}");
-        assert!(one["judged"].as_u64().unwrap() > 6000, "{one}");
+fn the_watchdog_counts_violations_of_the_physics() {
+    let quiet = Disturbed::with_fault("", &SETTLED);
+    for watched in quiet.summary["watchdog"]["watched"].as_array().unwrap() {
+        assert_eq!(watched["breaches"], 0, "{watched}");
+        assert!(watched["judged"].as_u64().unwrap() > 6000, "{watched}");
     }
-    // An estimate may be wrong where no guard can know.
+    // A wrong estimate that no guard can detect.
     let wrong = fault("noise-burst", "observer", 300, 100, "deviation = 0.01");
     let tight = ["watchdog.energy_drift_max=1e-3", "watchdog.momentum_drift_max=1e-3"];
-    let done = Disturbed::of(&wrong, &[&SETTLED[..], &tight].concat());
+    let done = Disturbed::with_fault(&wrong, &[&SETTLED[..], &tight].concat());
     for quantity in ["energy_drift", "momentum_drift"] {
         let watched = done.summary["watchdog"]["watched"].as_array().unwrap();
-        let one = watched.iter().find(|one| one["quantity"] == quantity).unwrap();
-        assert!(one["breaches"].as_u64().unwrap() > 50, "{one}");
-        assert_eq!(one["first_tick"].as_u64().unwrap() / 10, 30, "{one}");
+        let entry = watched.iter().find(|entry| entry["quantity"] == quantity).unwrap();
+        assert!(entry["breaches"].as_u64().unwrap() > 50, "{entry}");
+        assert_eq!(entry["first_tick"].as_u64().unwrap() / 10, 30, "{entry}");
     }
 }
 
-/// The orbit rigs have the same guards: what cannot be moves no follower.
+/// The orbit rigs have the same guards: impossible samples move no follower.
 #[test]
-fn a_follower_in_orbit_stays_where_it_is_too() {
+fn no_impossible_sample_moves_a_follower_in_orbit() {
     let text = std::fs::read_to_string(shipped("orbit-rendezvous")).unwrap();
     let declared =
         ["accept.peak_from_s=11.0", "accept.radius_error_du_peak=1e-3", "accept.velocity_error_du_s_peak=1e-3"];
@@ -274,7 +274,7 @@ fn a_follower_in_orbit_stays_where_it_is_too() {
     println!("{count} faults in orbit, worst excursion {worst:.1e} du of 1e-3 declared");
 }
 
-/// One fault of each kind, as processes in lockstep and in one thread: the same bits, counters and verdict.
+/// One fault of each kind, in lockstep processes and in one thread: same bits, counters and verdict.
 #[test]
 fn every_fault_is_the_same_in_lockstep_and_in_process() {
     let cases = [
@@ -306,18 +306,18 @@ fn every_fault_is_the_same_in_lockstep_and_in_process() {
             assert_eq!(done.code, Some(0), "{case}: {done:?}");
             done.json()
         };
-        let (one, many) = (summary("in-process"), summary("lockstep"));
-        assert_eq!(one["state"], many["state"], "{case}");
-        assert_eq!(one["books"], many["books"], "{case}");
-        assert_eq!(one["watchdog"], many["watchdog"], "{case}");
-        assert_eq!(one["books"]["balanced"], true, "{case}: {}", one["books"]["problems"]);
-        assert!(one["books"]["injected_faults"].as_u64().unwrap() > 0, "{case}");
+        let (in_process, lockstep) = (summary("in-process"), summary("lockstep"));
+        assert_eq!(in_process["state"], lockstep["state"], "{case}");
+        assert_eq!(in_process["books"], lockstep["books"], "{case}");
+        assert_eq!(in_process["watchdog"], lockstep["watchdog"], "{case}");
+        assert_eq!(in_process["books"]["balanced"], true, "{case}: {}", in_process["books"]["problems"]);
+        assert!(in_process["books"]["injected_faults"].as_u64().unwrap() > 0, "{case}");
     }
 }
 
-/// In real time samples are really lost, doubled and late; up to the first disturbed tick the bits are the same.
+/// In real time samples are lost, duplicated and delayed; up to the first disturbed tick the bits are the same.
 #[test]
-fn real_time_has_the_same_faults_and_balances_its_books() {
+fn real_time_has_the_same_faults_and_balanced_counters() {
     let bench = Bench::new();
     for (case, disturbed_at) in [
         (fault("drop", "leader", 300, 5, ""), Some(300)),
@@ -336,12 +336,13 @@ fn real_time_has_the_same_faults_and_balances_its_books() {
         assert_eq!(summary["books"]["balanced"], true, "{case}: {}", summary["books"]["problems"]);
         let injected = summary["books"]["injected_faults"].as_u64().unwrap();
         let missed = summary["books"]["missed_ticks"].as_u64().unwrap();
-        // On a loaded machine the tick of the fault may itself be missed.
+        // On a loaded machine the tick of the fault itself may be missed.
         assert!(injected > 0 || missed > 0, "{case}");
         let first = summary["state"]["first_disturbed_tick"].as_u64();
         match disturbed_at {
             Some(tick) => assert!(first.is_some_and(|first| first <= tick), "{case}: {first:?}"),
-            // The fault itself disturbs no tick; where one was, a role has counted what it lacked.
+            // The fault itself disturbs no tick; if one is disturbed, a role has counted a missed tick or a missing
+            // input.
             None => {
                 let roles = summary["books"]["roles"].as_object().unwrap();
                 let lacked = |role: &Value| role["missed"].as_u64().unwrap() + role["starved"].as_u64().unwrap();
@@ -356,7 +357,7 @@ fn real_time_has_the_same_faults_and_balances_its_books() {
     }
 }
 
-/// The hash over the first ticks of a run in one thread, as `hashes.txt` has it.
+/// Returns the hash over the first ticks of a run in one thread, from `hashes.txt`.
 fn hash_after(case: &str, overrides: &[&str], ticks: u64) -> String {
     let bench = Bench::new();
     let file = bench.path("case.toml");
@@ -373,10 +374,10 @@ fn hash_after(case: &str, overrides: &[&str], ticks: u64) -> String {
 }
 
 #[test]
-fn a_fault_that_makes_no_sense_is_refused_with_place_and_remedy() {
+fn an_invalid_fault_is_refused_with_place_and_remedy() {
     let bench = Bench::new();
     let good = "kind = \"drop\"\nrole = \"leader\"\nfrom_tick = 10";
-    for (change, said) in [
+    for (change, message) in [
         (("\"drop\"", "\"dorp\""), "did you mean `drop`?"),
         (("\"leader\"", "\"leadr\""), "there is no role `leadr` in this scenario; did you mean `leader`?"),
         (("= 10", "= -1"), "not below 0"),
@@ -439,14 +440,14 @@ fn a_fault_that_makes_no_sense_is_refused_with_place_and_remedy() {
         std::fs::write(&file, text(&format!("[[fault]]\n{fault}\n"))).unwrap();
         let done = bench.run(&["check", file.to_str().unwrap(), "--set", "clock=in-process"]);
         assert_eq!(done.code, Some(2), "{fault}: {done:?}");
-        assert!(done.stderr.contains(said) && done.stderr.contains("fault[0]"), "{fault}: {}", done.stderr);
+        assert!(done.stderr.contains(message) && done.stderr.contains("fault[0]"), "{fault}: {}", done.stderr);
     }
 }
 
 #[test]
-fn limits_and_watchdog_that_make_no_sense_are_refused() {
+fn invalid_limits_and_watchdogs_are_refused() {
     let bench = Bench::new();
-    for (scenario, set, said) in [
+    for (scenario, set, message) in [
         ("faults", "limits.rate_rad_s=0.5", "is not above the 1.510 rad/s that a body may turn at"),
         ("faults", "limits.acceleration_rad_s2=0.0", "not above zero"),
         ("faults", "limits.speed_du_s=1.0", "unknown key"),
@@ -465,13 +466,13 @@ fn limits_and_watchdog_that_make_no_sense_are_refused() {
     ] {
         let done = bench.run(&["check", shipped(scenario).to_str().unwrap(), "--set", set]);
         assert_eq!(done.code, Some(2), "{set}: {done:?}");
-        assert!(done.stderr.contains(said), "{set}: {}", done.stderr);
+        assert!(done.stderr.contains(message), "{set}: {}", done.stderr);
     }
 }
 
-/// A scripted kill is the same event under both clocks that look at no time: the same books, the same bits.
+/// A scripted kill has the same effect under both clocks without time: same counters, same bits.
 #[test]
-fn a_killed_role_leaves_the_same_bits_in_one_thread_as_among_processes() {
+fn a_killed_role_gives_the_same_bits_in_one_thread_and_as_processes() {
     for role in ["leader", "follower", "observer", "controller"] {
         let bench = Bench::new();
         let text = std::fs::read_to_string(shipped("rigid-pair")).unwrap();
@@ -482,22 +483,22 @@ fn a_killed_role_leaves_the_same_bits_in_one_thread_as_among_processes() {
             assert_eq!(done.code, Some(0), "{role} {clock}: {done:?}");
             serde_json::from_str::<serde_json::Value>(&done.stdout).unwrap()
         });
-        let [one, other] = &summaries;
-        assert_eq!(one["state"]["hash"], other["state"]["hash"], "{role}");
-        assert_eq!(one["books"]["roles"], other["books"]["roles"], "{role}");
+        let [first, second] = &summaries;
+        assert_eq!(first["state"]["hash"], second["state"]["hash"], "{role}");
+        assert_eq!(first["books"]["roles"], second["books"]["roles"], "{role}");
         for summary in &summaries {
             let incident = &summary["incidents"][0];
             assert_eq!((incident["role"].as_str(), incident["tick"].as_u64()), (Some(role), Some(2345)), "{incident}");
             assert_eq!(summary["books"]["balanced"], true, "{role}");
         }
-        assert_eq!(one["incidents"][0]["recovery_s"], other["incidents"][0]["recovery_s"], "{role}");
+        assert_eq!(first["incidents"][0]["recovery_s"], second["incidents"][0]["recovery_s"], "{role}");
         bench.assert_clean(&[]);
     }
 }
 
-/// The worst reaction to silence, in ticks: the safe command acts at the `command_timeout_ticks`th tick without a command.
+/// The safe command acts at exactly the `command_timeout_ticks`th tick without a command.
 #[test]
-fn a_plant_is_safe_after_exactly_as_many_missing_commands_as_it_was_told() {
+fn a_plant_is_safe_after_exactly_command_timeout_ticks() {
     for timeout in [1, 5, 20] {
         let bench = Bench::new();
         let text = std::fs::read_to_string(shipped("rigid-pair")).unwrap();
@@ -515,9 +516,9 @@ fn a_plant_is_safe_after_exactly_as_many_missing_commands_as_it_was_told() {
     }
 }
 
-/// A tick that is not due yet is nobody's, for the scorer too: one flipped bit must not end the judging of a run.
+/// A tick from the future is ignored by the scorer too: one flipped bit must not end the scoring of a run.
 #[test]
-fn a_tick_from_the_future_does_not_blind_the_scorer() {
+fn a_tick_from_the_future_does_not_stop_the_scorer() {
     let bench = Bench::new();
     let text = std::fs::read_to_string(shipped("rigid-pair")).unwrap();
     let fault = |role: &str, tick: u64| {
@@ -534,10 +535,10 @@ fn a_tick_from_the_future_does_not_blind_the_scorer() {
     bench.assert_clean(&[]);
 }
 
-/// Without faults every sample is right, and a guard doubts it for a bounded time only: also that of a follower which a wrong
-/// first guess has driven beyond what it may turn at.
+/// Without faults every sample is right. A guard suspects samples only for a bounded time, also those of a follower
+/// that a wrong first guess has driven beyond its rate limit.
 #[test]
-fn a_guard_is_no_trap() {
+fn a_guard_accepts_right_samples_again_after_a_bounded_time() {
     let smallsat = ["leader.inertia_kg_m2=[0.082, 0.091, 0.034]", "leader.initial_rate_rad_s=[0.012, -0.01, 0.012]"];
     let at_rest = ["observer.initial_guess_rad_s=0.2", "follower.0.initial_rate_rad_s=[0.0, 0.0, 0.0]"];
     let fleet = ["follower.0.count=5", "follower.0.initial_rate_spread_rad_s=[0.1, 0.1, 0.1]"];
@@ -552,7 +553,7 @@ fn a_guard_is_no_trap() {
         let text = std::fs::read_to_string(shipped("rigid-pair")).unwrap();
         let run = Disturbed::run(&Scenario::parse(&text, "trap", &overrides).unwrap());
         assert!(run.last < SETTLED_RAD_S, "{overrides:?}: {}", run.last);
-        // The guards of the controller and of nobody else doubt; the follower leaves its range once, and comes back.
+        // Only the controller's guards suspect samples; the follower leaves its range once and returns.
         assert_eq!(run.count("rejected_samples"), if doubts { SUSPECT_SAMPLES } else { 0 }, "{overrides:?}");
     }
 }

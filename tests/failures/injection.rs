@@ -1,8 +1,8 @@
 //! Injected system-call failures: each system call that a command makes in its own code fails once with each plausible
-//! error. Whatever fails, the command names cause and remedy, exits with the right code in time, and leaves nothing behind.
+//! error. The command then names cause and remedy, exits in time with the right code, and leaves nothing behind.
 //!
-//! By default one cell of each system call. `COROTATE_INJECT=N` runs all targets with all errors, at N places in each
-//! system call's sequence; `COROTATE_INJECT=run:openat:EMFILE:120,...` runs these cells and prints what was said.
+//! By default one cell of each system call. `COROTATE_INJECT=N` runs all targets with all errors, at N places of each
+//! system call's sequence; `COROTATE_INJECT=run:openat:EMFILE:120,...` runs these cells and prints the output.
 
 use crate::common::{self, Bench, Done, Running, WATCHDOG, await_some, send_signal};
 use libc::{SIGCONT, SIGKILL, SIGSTOP, SIGTERM};
@@ -13,7 +13,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-/// System calls with the errors that a system gives for them in practice.
+/// System calls with the errors that a system returns in practice.
 const ERRORS: [(&str, &[&str]); 38] = [
     ("openat", &["EMFILE", "ENFILE", "ENOSPC", "EACCES", "EIO", "ENOMEM", "EINTR"]),
     ("ftruncate", &["ENOSPC", "EIO", "EINTR"]),
@@ -55,16 +55,16 @@ const ERRORS: [(&str, &[&str]); 38] = [
     ("fdatasync", &["EIO", "ENOSPC"]),
 ];
 
-/// Words of the transport, or of a debug dump, that tell a user nothing.
+/// Words of the transport or of a debug dump that do not help a user.
 const RAW: [&str; 7] =
     ["InternalError", "HangsInCreation", "panicked", "Os {", "FailedTo", "UnableTo", "InsufficientPerm"];
 
-/// How long a command with a failure may take before it counts as hung, where the machine is not shared.
+/// Time limit of a command with a failure on an otherwise idle machine.
 const LIMIT: Duration = Duration::from_secs(10);
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_corotate");
 
-/// A recorder or role that has slept so often is in its loop.
+/// Number of sleeps after which a recorder or role counts as being in its loop.
 const LOOP_CALLS: usize = 60;
 
 /// The process whose system calls fail.
@@ -99,7 +99,7 @@ impl fmt::Display for Target {
     }
 }
 
-/// One failure: a target's n-th call, and what it gives.
+/// One failure: a target's n-th call of a kind, and its error.
 #[derive(Debug, Clone)]
 struct Cell {
     target: Target,
@@ -114,7 +114,7 @@ impl fmt::Display for Cell {
     }
 }
 
-/// What came of a target, and of the run beside it.
+/// The result of a target, and of the run beside it.
 struct Ended {
     done: Done,
     beside: Option<Done>,
@@ -144,7 +144,7 @@ impl Target {
         words
     }
 
-    /// Runs the target under strace, with these options beside those that keep a log of the calls.
+    /// Runs the target under strace with these options, besides those that log the calls.
     fn trace(self, bench: &Bench, options: &[&str]) -> Ended {
         let scenario = self.scenario(bench);
         let scenario: Vec<&str> = scenario.iter().map(String::as_str).collect();
@@ -174,7 +174,7 @@ impl Target {
         let began = Instant::now();
         let mut target = Running::new(bench.command_of(Path::new("strace")).args(options).arg(PROGRAM).args(words));
         let beside = beside.map(|beside| {
-            // Until it has ended, or is in its loop and will not.
+            // Until it has ended, or is in its loop.
             let calls = || std::fs::read_to_string(&log).unwrap_or_default().matches("clock_nanosleep").count();
             await_some(|| (target.has_ended() || (self != Self::Watch && calls() > LOOP_CALLS)).then_some(()));
             beside.signal(SIGTERM);
@@ -189,7 +189,7 @@ fn calls() -> String {
     ERRORS.map(|(call, _)| call).join(",")
 }
 
-/// The numbers of the calls that a target makes in its own code and that may fail, by call.
+/// Returns the numbers of the calls of each kind that a target makes in its own code and that may fail.
 fn sites(target: Target) -> Vec<(&'static str, Vec<usize>)> {
     let bench = Bench::new();
     let trace = format!("trace={},sigaltstack", calls());
@@ -197,7 +197,7 @@ fn sites(target: Target) -> Vec<(&'static str, Vec<usize>)> {
     assert!(ended.done.signal.is_none() && ended.done.code.is_some_and(|code| code < 2), "{target}: {:?}", ended.done);
     let log = std::fs::read_to_string(bench.path("strace.log")).unwrap();
     let lines: Vec<&str> = match target {
-        // A plant's.
+        // The log of a plant.
         Target::Tree => {
             let plant = log.lines().find(|line| line.contains("execve(") && line.contains("\"plant\"")).unwrap();
             let pid = plant.split_whitespace().next().unwrap();
@@ -206,36 +206,38 @@ fn sites(target: Target) -> Vec<(&'static str, Vec<usize>)> {
         _ => log.lines().collect(),
     };
     bench.assert_clean(&[]);
-    // What the loader does is not the program's: its own code begins once the standard library has made its signal stack.
+    // The program's own code begins once the standard library has set up its signal stack; before that it is the
+    // loader.
     let begin = lines.iter().position(|line| line.starts_with("sigaltstack({")).unwrap();
-    let of = |call: &'static str| {
+    let numbers_of = |call: &'static str| {
         let start = format!("{call}(");
         let all = lines.iter().enumerate().filter(|(_, line)| line.starts_with(&start)).enumerate();
         let own = all.filter(|(_, (line, text))| *line > begin && may_fail(call, text));
         (call, own.map(|(index, _)| index + 1).collect::<Vec<_>>())
     };
-    ERRORS.map(|(call, _)| of(call)).into_iter().filter(|(_, numbers)| !numbers.is_empty()).collect()
+    ERRORS.map(|(call, _)| numbers_of(call)).into_iter().filter(|(_, numbers)| !numbers.is_empty()).collect()
 }
 
-/// Memory for the heap is not asked for by the program, and nothing can be said where there is no output.
+/// Excludes memory for the heap, which the program does not request itself, and output, without which no message is
+/// possible.
 fn may_fail(call: &str, text: &str) -> bool {
     match call {
         "mmap" => text.contains("MAP_SHARED") || text.contains("MAP_STACK"),
         "fcntl" => text.contains("F_SETLK") || text.contains("F_DUPFD"),
-        // A process may always ask for its own limits.
+        // A process may always read its own limits.
         "prlimit64" => !text.contains(", NULL, "),
         "write" => !text.starts_with("write(1,") && !text.starts_with("write(2,"),
         _ => true,
     }
 }
 
-/// At most so many of the numbers, evenly spread, the first and the last among them.
+/// Returns at most `most` of the numbers, evenly spread, with the first and the last.
 fn spread(numbers: &[usize], most: usize) -> BTreeSet<usize> {
     let last = numbers.len() - 1;
     (0..most).map(|index| numbers[(last * index).checked_div(most - 1).unwrap_or(last / 2)]).collect()
 }
 
-/// Why a cell is not as it must be.
+/// Runs a cell; returns the reason if the result is not as it must be.
 fn judge(cell: &Cell, limit: Duration, verbose: bool) -> Result<Duration, String> {
     let bench = Bench::new();
     let inject = format!("inject={}:error={}:when={}", cell.call, cell.error, cell.when);
@@ -255,16 +257,16 @@ fn judge(cell: &Cell, limit: Duration, verbose: bool) -> Result<Duration, String
         println!("{}", log.lines().filter(|line| line.contains("INJECTED")).collect::<Vec<_>>().join("\n"));
     }
     if took > limit || began.elapsed() > WATCHDOG {
-        return Err(format!("it took {took:?}; {}", done.stderr));
+        return Err(format!("it took {took:?}: {}", done.stderr));
     }
-    told_clearly(&done, &[0, 1, 2, 4, 5])?;
+    check_message(&done, &[0, 1, 2, 4, 5])?;
     if let Some(beside) = beside {
         let codes: &[i32] = if cell.target == Target::Role { &[1, 4, 143] } else { &[143] };
-        told_clearly(&beside, codes).map_err(|reason| format!("the run beside it: {reason}"))?;
+        check_message(&beside, codes).map_err(|reason| format!("the run beside it: {reason}"))?;
     }
     if matches!(cell.call.as_str(), "unlink" | "unlinkat" | "rmdir" | "getdents64" | "openat" | "newfstatat" | "statx")
     {
-        // What could not be removed is so by the next run of the same user.
+        // The next run of the same user removes what could not be removed.
         bench.run(&["doctor", "--clean"]);
     }
     let left = await_clean(&bench, &domains);
@@ -282,8 +284,8 @@ fn await_clean(bench: &Bench, domains: &[std::path::PathBuf]) -> Vec<std::path::
     }
 }
 
-/// Whether a command that failed said why, and what to do.
-fn told_clearly(done: &Done, codes: &[i32]) -> Result<(), String> {
+/// Checks that a failed command names the reason and a remedy.
+fn check_message(done: &Done, codes: &[i32]) -> Result<(), String> {
     let Done { code, signal, stderr, .. } = done;
     if !code.is_some_and(|code| codes.contains(&code)) {
         return Err(format!("exit code {code:?}, signal {signal:?}: {stderr}"));
@@ -291,21 +293,21 @@ fn told_clearly(done: &Done, codes: &[i32]) -> Result<(), String> {
     if let Some(raw) = RAW.iter().find(|raw| stderr.contains(**raw)) {
         return Err(format!("it says `{raw}`: {stderr}"));
     }
-    let told = stderr.lines().any(|line| line.starts_with("corotate: ") && line.contains("; "));
-    if *code != Some(0) && *code != Some(143) && !told {
+    let explained = stderr.lines().any(|line| line.starts_with("corotate: ") && line.contains("; "));
+    if *code != Some(0) && *code != Some(143) && !explained {
         return Err(format!("exit code {code:?} without cause and remedy: {stderr}"));
     }
     Ok(())
 }
 
-/// The domains that a traced process has opened something of.
+/// Returns the domains in which a traced process has opened a file.
 fn domains(log: &str) -> Vec<std::path::PathBuf> {
     let named = log.split("corotate_").skip(1).filter_map(|rest| rest.get(..32));
     let ids: BTreeSet<&str> = named.filter(|id| id.bytes().all(|byte| byte.is_ascii_hexdigit())).collect();
     ids.into_iter().map(Into::into).collect()
 }
 
-/// Ends what hangs, so that its cell is told.
+/// Ends hanging processes, so that their cell is reported.
 struct Watchdog {
     stop: std::sync::Arc<std::sync::atomic::AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
@@ -314,10 +316,10 @@ struct Watchdog {
 impl Watchdog {
     fn new(bench: &Bench) -> Self {
         let stop = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
-        let (told, mark) = (stop.clone(), bench.mark());
+        let (stopped, mark) = (stop.clone(), bench.mark());
         let thread = std::thread::spawn(move || {
             let end = Instant::now() + WATCHDOG / 4;
-            while !told.load(Ordering::Relaxed) {
+            while !stopped.load(Ordering::Relaxed) {
                 if Instant::now() > end {
                     common::processes_marked(&mark).into_iter().for_each(|pid| send_signal(pid, SIGKILL));
                 }
@@ -333,7 +335,7 @@ impl Watchdog {
     }
 }
 
-/// Judges cells two at a time; tells those that are not as they must be.
+/// Judges cells two at a time; returns the failures.
 fn judge_all(cells: &[Cell], limit: Duration, verbose: bool) -> Vec<String> {
     let (next, failures) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
     let slowest = Mutex::new(Duration::ZERO);
@@ -378,14 +380,14 @@ fn cells(target: Target, most_errors: usize, most_sites: usize) -> Vec<Cell> {
     cells
 }
 
-/// One cell of each system call, the targets taken in turn.
+/// Returns one cell of each system call, with the targets in turn.
 fn one_of_each_call() -> Vec<Cell> {
     let all: Vec<Cell> = TARGETS.into_iter().flat_map(|target| cells(target, 1, 1)).collect();
-    let of = |(index, (call, _)): (usize, &(&str, &[&str]))| {
-        let those: Vec<&Cell> = all.iter().filter(|cell| cell.call == *call).collect();
-        those.get(index % those.len().max(1)).map(|cell| (*cell).clone())
+    let pick = |(index, (call, _)): (usize, &(&str, &[&str]))| {
+        let candidates: Vec<&Cell> = all.iter().filter(|cell| cell.call == *call).collect();
+        candidates.get(index % candidates.len().max(1)).map(|cell| (*cell).clone())
     };
-    ERRORS.iter().enumerate().filter_map(of).collect()
+    ERRORS.iter().enumerate().filter_map(pick).collect()
 }
 
 fn parse(text: &str) -> Cell {
@@ -397,7 +399,7 @@ fn parse(text: &str) -> Cell {
 }
 
 #[test]
-fn every_failed_system_call_is_told_and_leaves_nothing() {
+fn every_failed_system_call_is_reported_and_leaves_nothing_behind() {
     let asked = std::env::var("COROTATE_INJECT").unwrap_or_default();
     let (cells, limit, verbose) = match asked.as_str() {
         "" => (one_of_each_call(), WATCHDOG, false),
@@ -412,9 +414,10 @@ fn every_failed_system_call_is_told_and_leaves_nothing() {
     assert!(failures.is_empty(), "{} of {} cells:\n{}", failures.len(), cells.len(), failures.join("\n"));
 }
 
-/// A file system without locks, for the results or for the domain: the run is refused with the path, and leaves no lock file.
+/// On a file system without locks, for the results or the domain, the run is refused with the path and leaves no lock
+/// file.
 #[test]
-fn what_cannot_be_locked_is_an_error() {
+fn a_file_system_without_locks_is_refused() {
     for (calls, file) in [("1+", "out/run.lock"), ("2+", ".lock")] {
         let bench = Bench::new();
         let scenario = Target::Run.scenario(&bench);
@@ -422,22 +425,23 @@ fn what_cannot_be_locked_is_an_error() {
         let inject = format!("inject=flock:error=ENOLCK:when={calls}");
         let options = ["-o", "/dev/null", "-e", &inject, PROGRAM];
         let done = bench.start_program(Path::new("strace"), &[&options, &scenario[..]].concat()).wait();
-        told_clearly(&done, &[1]).unwrap();
+        check_message(&done, &[1]).unwrap();
         assert!(done.stderr.contains(file), "{done:?}");
         bench.assert_clean(&[]);
     }
 }
 
-/// A watcher puts away what it made anew in a run that is gone; a run that it cannot look at is not gone.
+/// A watcher removes the files it has recreated in a run that no longer exists. A run that it cannot examine counts as
+/// existing.
 #[test]
-fn a_watcher_that_cannot_look_at_a_run_removes_nothing() {
+fn a_watcher_that_cannot_examine_a_run_removes_nothing() {
     let bench = Bench::new();
     let scenario = Target::Watch.scenario(&bench);
     let run = bench.start(&scenario.iter().map(String::as_str).collect::<Vec<_>>());
     bench.await_role("controller");
     let domains = bench.domains();
     let (domain, lock) = (domains[0].to_str().unwrap(), domains[0].with_extension("lock"));
-    // It looks three times: as it finds the run, and twice as it joins.
+    // It examines the run three times: when it finds it, and twice when it joins.
     let fails = ["-o", "/dev/null", "-P", lock.to_str().unwrap(), "-e", "inject=statx:error=EACCES:when=4+"];
     let done =
         bench.start_program(Path::new("strace"), &[&fails[..], &[PROGRAM, "watch", domain, "--once", "1"]].concat());
@@ -448,9 +452,9 @@ fn a_watcher_that_cannot_look_at_a_run_removes_nothing() {
     bench.assert_clean(&domains);
 }
 
-/// A janitor that hangs keeps nobody waiting.
+/// A stopped janitor delays no run.
 #[test]
-fn a_stopped_janitor_holds_no_run_up() {
+fn a_stopped_janitor_delays_no_run() {
     let bench = Bench::new();
     let scenario = Target::Watch.scenario(&bench);
     let run = bench.start(&scenario.iter().map(String::as_str).collect::<Vec<_>>());
@@ -463,7 +467,7 @@ fn a_stopped_janitor_holds_no_run_up() {
     bench.assert_clean(&domains);
 }
 
-/// Where a user may start only so many processes and threads, a run that needs more is refused in words.
+/// A run that needs more processes and threads than its user may start is refused with a reason.
 #[test]
 fn too_few_threads_are_an_error() {
     let bench = Bench::unprivileged();
@@ -473,12 +477,12 @@ fn too_few_threads_are_an_error() {
     for limit in ["--nproc=1", "--nproc=2", "--nproc=3", "--nproc=4", "--nproc=5", "--nproc=6"] {
         let limited = [&[limit, program.to_str().unwrap()], &scenario[..]].concat();
         let done = bench.start_program(Path::new("prlimit"), &limited).wait();
-        told_clearly(&done, &[1, 4]).unwrap();
+        check_message(&done, &[1, 4]).unwrap();
         bench.assert_clean(&[]);
     }
 }
 
-/// A run whose stderr takes nothing goes on: words to the user are not what it is for.
+/// A run continues when its stderr cannot be written.
 #[test]
 fn a_full_stderr_ends_no_run() {
     let bench = Bench::new();
@@ -491,16 +495,16 @@ fn a_full_stderr_ends_no_run() {
     bench.assert_clean(&domains);
 }
 
-/// Whoever dies after its last tick, with its report written, has done all that it was there for.
+/// A process that dies after its last tick, with its report written, has finished its work.
 #[test]
-fn a_death_after_the_last_tick_is_noted_and_costs_nothing() {
+fn a_death_after_the_last_tick_is_recorded_without_loss() {
     let bench = Bench::new();
     let scenario = Target::Realtime.scenario(&bench);
     let scenario = scenario.iter().map(|word| if word == "0.2" { "2" } else { word }).chain(["--record"]);
     let run = bench.start(&scenario.collect::<Vec<_>>());
     let controller = bench.await_role("controller");
     let domains = bench.domains();
-    // The recording is begun when the ticks are. While the launcher stands still, nobody lets the roles go.
+    // The recording begins with the ticks. While the launcher is stopped, no role is released.
     await_some(|| std::fs::metadata(bench.path("out/run.mcap")).ok().filter(|file| file.len() > 0));
     run.signal(SIGSTOP);
     let report = domains[0].join("controller.report.json");

@@ -1,9 +1,9 @@
-//! Whoever joins a run may die at any place of his joining and leaving: the run goes on and ends in order, and his place can
-//! be taken again.
+//! A process that joins a run may die at any point of joining and leaving: the run continues and ends in order, and
+//! another process can take its place.
 //!
-//! strace kills a joiner as it makes its n-th system call of a kind. With `COROTATE_JOINERS=all` it is every call of the
-//! kinds below (half an hour), else some of each. Nothing is judged by the machine's speed: a role that stood still is one
-//! that its launcher missed for `STILL_S` of its own attention, and in lockstep no tick may be missed at all.
+//! strace kills a joiner at its n-th system call of a kind. `COROTATE_JOINERS=all` tries every call of the kinds below
+//! (half an hour), otherwise some of each. The machine's speed does not matter: a role counts as stopped if its
+//! launcher missed it for `STILL_S` of the launcher's own running time, and in lockstep no tick may be missed.
 
 use crate::common::{Bench, Done, Running, await_some, catches, python, root, send_signal, shipped, status_of};
 use libc::{SIGKILL, SIGTERM};
@@ -12,16 +12,16 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 const CALLS: [&str; 5] = ["openat", "ftruncate", "mmap", "rename", "futex"];
-/// Of each kind so many calls are tried in the short form.
+/// Number of calls of each kind that the short form tries.
 const FEW: usize = 3;
-/// For so long no role may stand still, s.
+/// Longest allowed stop of a role, s.
 const STILL_S: &str = "1";
 
-/// How a joiner is started, but for strace; `n` tells one from another.
+/// A command that joins a run, without strace; `n` makes output names unique.
 struct Joiner {
     name: &'static str,
     arguments: fn(domain: &Path, n: usize) -> Vec<String>,
-    /// It stays until it is told to leave.
+    /// True if it stays until it is asked to leave.
     stays: bool,
 }
 
@@ -48,7 +48,7 @@ const FOXGLOVE: Joiner = Joiner {
     stays: true,
 };
 
-/// A command under strace, with more options for it.
+/// Runs a command under strace with these options.
 fn strace(bench: &Bench, options: &[&str], command: &[String]) -> Running {
     let mut strace = bench.command_of("strace".as_ref());
     strace.args(["-f", "-qq"]).args(options).args(command);
@@ -60,21 +60,21 @@ fn killed_at(bench: &Bench, call: &str, n: usize, command: &[String]) -> Running
     strace(bench, &["-o", "/dev/null", "-e", &format!("trace={call}"), "-e", &inject], command)
 }
 
-/// The number of calls of each kind that one thread of a traced program made, from the first one that concerns `domain` on:
-/// what comes before is the interpreter's or the loader's, and nobody else's matter.
+/// Returns the numbers of the calls of each kind that one thread of a traced program made, from the first one that
+/// concerns `domain` on. Earlier calls belong to the interpreter or loader.
 fn calls(trace: &Path, domain: &Path) -> Vec<(&'static str, std::ops::RangeInclusive<usize>)> {
     let text = std::fs::read_to_string(trace).unwrap();
     let id = domain.file_name().unwrap().to_str().unwrap();
     let joins = text.lines().position(|line| line.contains(id) && !line.contains("execve")).unwrap();
-    let of = |call: &'static str| {
+    let range_of = |call: &'static str| {
         let is = |line: &&str| line.split_whitespace().nth(1).is_some_and(|word| word.starts_with(&format!("{call}(")));
         let before = text.lines().take(joins).filter(is).count();
         (call, before + 1..=text.lines().filter(is).count())
     };
-    CALLS.map(of).into()
+    CALLS.map(range_of).into()
 }
 
-/// The deaths to be tried: kind of call, and the how manieth.
+/// Returns the deaths to try: kind and number of the call.
 fn deaths(trace: &Path, domain: &Path) -> Vec<(&'static str, usize)> {
     let all = std::env::var("COROTATE_JOINERS").is_ok_and(|which| which == "all");
     let some = |(call, numbers): (&'static str, std::ops::RangeInclusive<usize>)| {
@@ -84,19 +84,17 @@ fn deaths(trace: &Path, domain: &Path) -> Vec<(&'static str, usize)> {
     calls(trace, domain).into_iter().flat_map(some).collect()
 }
 
-/// Whether a process sleeps, and would hear that it is to leave; none if it has ended.
-fn rests(pid: u32) -> Option<bool> {
+/// Returns true if a process sleeps and handles the signal to leave; `None` if it has ended.
+fn is_idle(pid: u32) -> Option<bool> {
     let state = status_of(pid, "State");
     (!state.is_empty() && !state.starts_with('Z')).then(|| state.starts_with('S') && catches(pid, SIGTERM))
 }
 
-/// Waits for a joiner under strace, telling it to leave if it stays: once it has had nothing to do for half a second, however
-/// long a loaded machine takes until then.
+/// Waits for a joiner under strace. A joiner that stays is asked to leave once it has been idle for half a second.
 fn await_left(joiner: &Joiner, mut running: Running) -> Done {
     if joiner.stays {
         let children = format!("/proc/{0}/task/{0}/children", running.pid());
-        // Before the joiner, strace has children of its own, by which it learns what this machine can trace; one that has just
-        // ended has no name.
+        // strace first starts children of its own to test what it can trace; one that has just ended has no name.
         let is_joiner = |pid: &u32| status_of(*pid, "Name") == "corotate";
         let child = await_some(|| {
             let text = std::fs::read_to_string(&children).unwrap_or_default();
@@ -105,7 +103,7 @@ fn await_left(joiner: &Joiner, mut running: Running) -> Done {
         });
         let (mut rested, end) = (0_u32, Instant::now() + Duration::from_secs(60));
         while rested < 50 && Instant::now() < end {
-            match child.and_then(rests) {
+            match child.and_then(is_idle) {
                 Some(true) => rested += 1,
                 Some(false) => rested = rested.saturating_sub(10),
                 None => break,
@@ -117,7 +115,7 @@ fn await_left(joiner: &Joiner, mut running: Running) -> Done {
     running.wait()
 }
 
-/// A run in which joiners die, one after the other.
+/// Kills joiners of one run, one after the other.
 fn joiners_may_die(joiner: &Joiner, clock: &str, more: &[&str]) {
     let bench = Bench::new();
     let file = shipped("rigid-pair");
@@ -126,7 +124,7 @@ fn joiners_may_die(joiner: &Joiner, clock: &str, more: &[&str]) {
         ["run", file.to_str().unwrap(), "--clock", clock, "--tick-hz=200", "--duration=100000", "--json", "--out=out"];
     let run = bench.start(&[&run[..], &["--set=accept={}", "--set", &still], more].concat());
     let domain = await_some(|| bench.domains().pop());
-    // The first screen is there once ticks run, and says so.
+    // The first screen appears once ticks run.
     let look = || bench.run(&["watch", domain.to_str().unwrap(), "--once", "1"]);
     await_some(|| look().stdout.contains("running").then_some(()));
 
@@ -146,10 +144,10 @@ fn joiners_may_die(joiner: &Joiner, clock: &str, more: &[&str]) {
 
     // Their places are free again.
     await_some(|| look().stdout.contains("running").then_some(()));
-    let told = Instant::now();
+    let signalled = Instant::now();
     run.signal(SIGTERM);
     let done = run.wait();
-    println!("{}, {clock}: {killed} deaths; the run ended {:?} after it was told", joiner.name, told.elapsed());
+    println!("{}, {clock}: {killed} deaths; the run ended {:?} after the signal", joiner.name, signalled.elapsed());
     assert_eq!(done.code, Some(128 + SIGTERM), "{done:?}");
     let summary = done.json();
     assert_eq!((&summary["incidents"], &summary["books"]["balanced"]), (&Value::Array(vec![]), &Value::Bool(true)));
@@ -174,7 +172,7 @@ fn a_recorder_may_die_anywhere() {
     joiners_may_die(&RECORD, "realtime", &[]);
 }
 
-/// It finds the recorder's place taken, and leaves again.
+/// A second recorder finds the recorder's place taken and leaves again.
 #[test]
 fn a_second_recorder_may_die_anywhere() {
     joiners_may_die(&RECORD, "realtime", &["--record"]);
@@ -186,7 +184,7 @@ fn foxglove_may_die_anywhere() {
     joiners_may_die(&FOXGLOVE, "realtime", &[]);
 }
 
-/// A run that waits for the foreign follower, and the seat.
+/// Starts a run that waits for the foreign follower; returns its domain and seat description.
 fn start_waiting(bench: &Bench) -> (Running, PathBuf, PathBuf) {
     let scenario = root().join("tests/hil/pair.toml");
     let run = ["run", scenario.to_str().unwrap(), "--clock=lockstep", "--duration=0.2", "--set=accept={}"];
@@ -196,7 +194,7 @@ fn start_waiting(bench: &Bench) -> (Running, PathBuf, PathBuf) {
     (running, seat, domain)
 }
 
-/// The seat of an external role can be taken again wherever its holder died.
+/// Another process can take an external role wherever its predecessor died.
 #[test]
 fn the_foreign_follower_may_die_anywhere() {
     let python = python("hil").to_str().unwrap().to_owned();
@@ -213,18 +211,18 @@ fn the_foreign_follower_may_die_anywhere() {
     let mut deaths = deaths(&trace, &domain).into_iter().peekable();
     while deaths.peek().is_some() {
         let (mut running, seat, domain) = start_waiting(&bench);
-        // One after the other in the same run, until one gets so far that the run ends with it.
+        // One after the other in the same run, until one lives to the end of the run.
         for (call, n) in deaths.by_ref() {
             let done = killed_at(&bench, call, n, &command(&seat)).wait();
             killed += usize::from(done.signal == Some(SIGKILL));
-            // One that died as it left may have been the last that the run waited for: the next comes too late.
+            // The run may end when one dies while leaving; the next one then comes too late.
             let late = matches!(done.code, Some(1 | 2)) && !seat.is_file();
             assert!(done.signal == Some(SIGKILL) || done.code == Some(0) || late, "at {call} {n}: {done:?}");
             if late || !domain.join("follower.seat.json").is_file() || running.has_ended() {
                 break;
             }
         }
-        // Nobody comes any more: the last one does.
+        // The last one is not killed.
         if domain.is_dir() && !running.has_ended() {
             let follower = bench.start_program(python.as_ref(), &[program.to_str().unwrap(), seat.to_str().unwrap()]);
             follower.wait();
@@ -232,7 +230,7 @@ fn the_foreign_follower_may_die_anywhere() {
         let done = running.wait();
         assert!([Some(0), Some(4)].contains(&done.code), "{done:?}");
         assert!(done.code == Some(0) || done.stderr.contains("follower"), "{done:?}");
-        // What one makes anew who joins as the run goes, and is killed, the next run removes.
+        // The next run removes files that a late, killed process has recreated.
         let next = shipped("rigid-pair");
         let next =
             ["run", next.to_str().unwrap(), "--clock=lockstep", "--duration=0.01", "--set=accept={}", "--out=out"];

@@ -1,5 +1,5 @@
-//! Roles killed at random: a random role of a random scenario, at a random place of its life, at a random instant,
-//! alone or together with others, or at a random system call. In lockstep nothing may be lost: hash, counters and metrics are those of an undisturbed run.
+//! Random kills: a random role of a random scenario, at a random failpoint, instant or system call, alone or together
+//! with companions. In lockstep nothing may be lost: hash, counters and metrics equal those of an undisturbed run.
 //!
 //! `tests/kill-campaign N` makes N kills; without a number it is a short run. Needs the feature `hooks`.
 
@@ -16,11 +16,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{LazyLock, Mutex};
 use std::time::Duration;
 
-/// Ticks of a run: long enough to be hit in the midst.
+/// Ticks of a run, long enough for most kills to hit it.
 const TICKS: u64 = 4_000;
 const PLACES: [&str; 6] = ["staged", "committing", "in-commit", "committed", "sent", "waiting"];
-/// What happens to samples on their way and to their ticks, all the time: whoever dies, dies amid it. (A generation with a
-/// flipped bit is another one in every life.)
+/// Faults on samples and ticks throughout the run, so that every death happens among faults. (A flipped bit in a
+/// generation differs between generations and is left out.)
 const DISTURBED: &str = r#"
 [[fault]]
 kind = "delay"
@@ -85,14 +85,14 @@ probability = 0.3
 "#;
 const CALLS: [&str; 5] = ["futex", "clock_nanosleep", "sched_yield", "mmap", "openat"];
 
-/// How a role is killed.
+/// The way a role is killed.
 #[derive(Debug)]
 enum Kill {
-    /// By itself, the how manieth time that it comes by a place.
+    /// By itself, when it passes a failpoint for the n-th time.
     Place(&'static str, u64),
-    /// From outside, so long after it was seen, µs.
+    /// From outside, at this time after it was found, µs.
     Instant(u64),
-    /// By a tracer, at its how manieth system call of a kind.
+    /// By a tracer, at its n-th system call of a kind.
     Call(&'static str, u64),
 }
 
@@ -100,8 +100,8 @@ enum Kill {
 struct Case {
     scenario: &'static str,
     role: String,
-    /// Who is killed in the same instant.
-    others: Vec<String>,
+    /// Roles that are killed at the same instant.
+    companions: Vec<String>,
     realtime: bool,
     kill: Kill,
 }
@@ -110,7 +110,7 @@ fn below(random: &mut Pcg64, limit: u64) -> u64 {
     random.next_u64() % limit
 }
 
-/// The shipped scenarios, and one whose samples are disturbed.
+/// Returns the shipped scenarios, and one with faults.
 fn scenarios() -> &'static [(&'static str, String)] {
     static ALL: LazyLock<Vec<(&str, String)>> = LazyLock::new(|| {
         let shipped = SHIPPED.iter().map(|(name, text)| (*name, (*text).to_owned()));
@@ -153,8 +153,9 @@ impl Case {
             _ => Kill::Instant(below(&mut random, if realtime { 1_000_000 } else { 250_000 })),
         };
         let together = matches!(kill, Kill::Instant(_)) && below(&mut random, 2) == 0;
-        let others = names.into_iter().filter(|name| together && *name != role && below(&mut random, 2) == 0).collect();
-        Self { scenario, role, others, realtime, kill }
+        let companions =
+            names.into_iter().filter(|name| together && *name != role && below(&mut random, 2) == 0).collect();
+        Self { scenario, role, companions, realtime, kill }
     }
 
     fn arguments(&self) -> Vec<String> {
@@ -167,12 +168,12 @@ impl Case {
         };
         let fixed =
             ["run", &format!("{}.toml", self.scenario), "--json", "--out=out", "--set=accept={}"].map(str::to_owned);
-        // However long a loaded machine takes to start everybody.
+        // Enough time for a loaded machine to start all roles.
         let fixed = fixed.into_iter().chain(["--set=launch.startup_timeout_s=120".to_owned()]);
         fixed.into_iter().chain(clock).collect()
     }
 
-    /// Runs it; whether the role was killed at all, and what is wrong.
+    /// Runs the case; returns whether the role was killed, and what is wrong.
     fn run(&self) -> (bool, Option<String>) {
         let bench = bench(self.scenario);
         let mut command = bench.command();
@@ -185,7 +186,7 @@ impl Case {
         match self.kill {
             Kill::Place(..) => {}
             Kill::Instant(after_us) => {
-                let roles = self.others.iter().chain([&self.role]);
+                let roles = self.companions.iter().chain([&self.role]);
                 let pids: Vec<_> = roles.map(|role| running.await_role_or_end(&bench, role)).collect();
                 std::thread::sleep(Duration::from_micros(after_us));
                 pids.iter().flatten().for_each(|pid| send_signal(*pid, libc_kill()));
@@ -211,11 +212,11 @@ impl Case {
     }
 
     fn judge(&self, done: &Done) -> (bool, Option<String>) {
-        // Before the ticks run a role that dies ends the run, and says so.
+        // A role that dies before the ticks run ends the run with an error.
         if done.code == Some(4) && done.stdout.is_empty() {
-            let mut killed = self.others.iter().chain([&self.role]);
+            let mut killed = self.companions.iter().chain([&self.role]);
             let named = killed.any(|role| done.stderr.contains(&format!("{role} died")));
-            return (true, (!named).then(|| format!("its death is not told: {done:?}")));
+            return (true, (!named).then(|| format!("its death is not reported: {done:?}")));
         }
         let Ok(summary) = serde_json::from_str::<Value>(&done.stdout) else {
             return (false, Some(format!("no summary: {done:?}")));
@@ -234,7 +235,7 @@ impl Case {
             None
         } else {
             let undisturbed = undisturbed(self.scenario);
-            difference(&told(&undisturbed), &told(&summary))
+            difference(&invariant_parts(&undisturbed), &invariant_parts(&summary))
         };
         (killed, wrong)
     }
@@ -246,7 +247,7 @@ fn libc_kill() -> i32 {
 
 fn lockstep(scenario: &str) -> Vec<String> {
     let parsed = parsed(scenario);
-    // What is scripted is played to its end.
+    // Scripted faults run to their end.
     let ticks = if parsed.faults.is_empty() { TICKS } else { parsed.last_tick };
     vec!["--clock=lockstep".to_owned(), format!("--duration={}", ticks as f64 * parsed.tick_s())]
 }
@@ -258,12 +259,13 @@ fn bench(scenario: &str) -> Bench {
     bench
 }
 
-/// The summary of a run of a scenario that nobody disturbs.
+/// Returns the summary of an undisturbed run of a scenario.
 fn undisturbed(scenario: &'static str) -> Value {
     static KNOWN: LazyLock<Mutex<BTreeMap<&'static str, Value>>> = LazyLock::new(Mutex::default);
     let mut known = KNOWN.lock().unwrap();
     let run = || {
-        let case = Case { scenario, role: String::new(), others: Vec::new(), realtime: false, kill: Kill::Instant(0) };
+        let case =
+            Case { scenario, role: String::new(), companions: Vec::new(), realtime: false, kill: Kill::Instant(0) };
         let arguments = case.arguments();
         let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
         let done = bench(scenario).run(&arguments);
@@ -272,8 +274,8 @@ fn undisturbed(scenario: &'static str) -> Value {
     known.entry(scenario).or_insert_with(run).clone()
 }
 
-/// What of a summary must not depend on whether a role was killed.
-fn told(summary: &Value) -> Value {
+/// Returns the parts of a summary that must not depend on a kill.
+fn invariant_parts(summary: &Value) -> Value {
     serde_json::json!({
         "state": summary["state"],
         "roles": summary["books"]["roles"],
@@ -285,7 +287,7 @@ fn told(summary: &Value) -> Value {
     })
 }
 
-/// The first thing in which two values differ.
+/// Returns the first difference of two values.
 fn difference(was: &Value, is: &Value) -> Option<String> {
     let keys = |value: &Value| value.as_object().map(|object| object.keys().cloned().collect::<Vec<_>>());
     match (was, is) {
@@ -301,8 +303,8 @@ fn difference(was: &Value, is: &Value) -> Option<String> {
 
 #[test]
 fn random_kills_lose_nothing_in_lockstep_and_balance_in_real_time() {
-    let of = |name: &str, otherwise: u64| std::env::var(name).map_or(otherwise, |text| text.parse().unwrap());
-    let (kills, seed) = (of("COROTATE_KILLS", 40), of("COROTATE_SEED", 1));
+    let variable = |name: &str, otherwise: u64| std::env::var(name).map_or(otherwise, |text| text.parse().unwrap());
+    let (kills, seed) = (variable("COROTATE_KILLS", 40), variable("COROTATE_SEED", 1));
     let traced = Command::new("strace").arg("-V").stdout(Stdio::null()).status().is_ok();
     if !traced {
         skipped("kills at system calls", "strace is missing (Debian: apt install strace)");
@@ -334,5 +336,5 @@ fn random_kills_lose_nothing_in_lockstep_and_balance_in_real_time() {
     let (hit, wrong) = (hit.into_inner(), wrong.into_inner().unwrap());
     println!("{kills} runs with seed {seed}: {hit} roles killed, {} differences", wrong.len());
     assert!(wrong.is_empty(), "{wrong:#?}");
-    assert!(hit * 2 > kills, "most of them were hit: {hit} of {kills}");
+    assert!(hit * 2 > kills, "only {hit} of {kills} kills hit a role");
 }

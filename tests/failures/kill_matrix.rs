@@ -1,15 +1,15 @@
-//! Every role, killed and stopped by itself at every place of its life: the run ends as it should, or recovers.
+//! Every role, killed or stopped at every failpoint: the run ends as it should, or recovers.
 //!
-//! Needs the feature `hooks`, which compiles those places into the program; `tests/run` turns it on.
+//! Needs the feature `hooks`, which compiles the failpoints into the program; `tests/run` turns it on.
 
 use crate::common::{ANY_TICKS, Bench, Done, Running, shipped};
 use serde_json::Value;
 
 const ROLES: [&str; 4] = ["leader", "follower", "observer", "controller"];
-/// Where a role may fail once ticks run, and the how manieth time it comes by there.
+/// The failpoints while ticks run, with the number of passes before the failure.
 const RUNNING: [&str; 6] = ["staged 901", "committing 903", "in-commit 904", "committed 905", "sent 902", "waiting 40"];
 
-/// Starts a run whose `role` fails at a place by a signal.
+/// Starts a run whose `role` fails at a failpoint by a signal.
 fn start(bench: &Bench, role: &str, place: &str, signal: &str, more: &[&str]) -> Running {
     let file = shipped("rigid-pair");
     let common = [
@@ -27,7 +27,7 @@ fn start(bench: &Bench, role: &str, place: &str, signal: &str, more: &[&str]) ->
     Running::new(&mut command)
 }
 
-/// What holds after every failure that a run survives: nobody hung, the role is named, the books balance, nothing is left.
+/// Asserts what holds after every survived failure: no hang, the role is named, the counters balance, nothing is left.
 fn assert_survived(bench: &Bench, done: &Done, role: &str, case: &str) -> Value {
     assert_eq!(done.code, Some(0), "{case}: {done:?}");
     let summary = done.json();
@@ -39,7 +39,7 @@ fn assert_survived(bench: &Bench, done: &Done, role: &str, case: &str) -> Value 
     summary
 }
 
-/// Lockstep waits for whoever is gone, and a successor has all that its predecessor had committed: not a bit is lost.
+/// Lockstep waits for a dead role, and its successor has its committed state: not a bit is lost.
 #[test]
 fn in_lockstep_a_killed_role_costs_nothing() {
     let lockstep = ["--clock", "lockstep"];
@@ -54,15 +54,15 @@ fn in_lockstep_a_killed_role_costs_nothing() {
             assert_eq!(summary["books"]["missed_ticks"], 0, "{case}");
             assert_eq!(summary["score"]["unscored_ticks"], 0, "{case}");
             assert!(summary["incidents"][0]["recovery_s"].is_number(), "{case}");
-            for told in ["/state/hash", "/books/roles", "/books/links", "/score/metrics"] {
-                assert_eq!(summary.pointer(told), undisturbed.pointer(told), "{case}: {told}");
+            for pointer in ["/state/hash", "/books/roles", "/books/links", "/score/metrics"] {
+                assert_eq!(summary.pointer(pointer), undisturbed.pointer(pointer), "{case}: {pointer}");
             }
         }
     }
 }
 
 #[test]
-fn in_lockstep_a_role_that_hangs_is_killed_and_brought_back() {
+fn in_lockstep_a_hanging_role_is_killed_and_restarted() {
     for role in ROLES {
         let bench = Bench::new();
         let more = ["--clock", "lockstep", "--set", "supervision.heartbeat_timeout_s=0.5"];
@@ -72,12 +72,12 @@ fn in_lockstep_a_role_that_hangs_is_killed_and_brought_back() {
     }
 }
 
-/// In real time the others go on: ticks are missed, counted, and the follower stays where its expiry keeps it.
+/// In real time the other roles continue: missed ticks are counted, and the command timeout bounds the follower.
 #[test]
-fn in_real_time_a_killed_or_stopped_role_is_back_and_the_follower_is_bounded_meanwhile() {
+fn in_real_time_a_killed_or_stopped_role_is_restarted_and_the_follower_stays_bounded() {
     let accept = format!("--set=accept={{settled_by_s=0,sync_error_rad_s_max=3,{ANY_TICKS}}}");
     let more = ["--tick-hz=200", "--duration=3", &accept, "--set=supervision.heartbeat_timeout_s=0.5"];
-    // Counted at 200 Hz: about the second half of the run's first second.
+    // At 200 Hz these counts fall into the second half of the run's first second.
     let places = ["staged 150", "in-commit 153", "committed 152", "sent 151", "waiting 150"];
     let cases = ROLES.iter().flat_map(|role| places.iter().flat_map(move |p| ["KILL", "STOP"].map(|s| (*role, *p, s))));
     let cases: Vec<_> = cases.collect();
@@ -96,14 +96,14 @@ fn in_real_time_a_killed_or_stopped_role_is_back_and_the_follower_is_bounded_mea
     }
 }
 
-/// A role that fails before the ticks run will not do better the next time.
+/// A role that fails before the ticks run is not restarted.
 #[test]
 fn a_role_that_fails_before_it_is_ready_ends_the_run() {
     for role in ROLES {
         for place in ["opening 1", "ready 1"] {
             for (signal, clock) in [("KILL", "realtime"), ("KILL", "lockstep"), ("HANG", "lockstep")] {
                 let bench = Bench::new();
-                // A hang is only found by a limit, which the others must keep on a loaded machine.
+                // A hang is found by a time limit, which the other roles must meet on a loaded machine.
                 let limit_s = if signal == "HANG" { 4 } else { 30 };
                 let limits =
                     ["launch.startup", "supervision.heartbeat"].map(|key| format!("--set={key}_timeout_s={limit_s}"));
@@ -118,7 +118,7 @@ fn a_role_that_fails_before_it_is_ready_ends_the_run() {
     }
 }
 
-/// A role that dies again and again is given up, and everything that was learned until then is told.
+/// A role that dies repeatedly is given up, and all results so far are reported.
 #[test]
 fn the_number_of_restarts_is_limited() {
     let bench = Bench::new();
@@ -128,6 +128,6 @@ fn the_number_of_restarts_is_limited() {
     let summary = done.json();
     assert_eq!(summary["incidents"][0]["action"], "stopped");
     assert_eq!(summary["books"]["balanced"], true, "{:#}", summary["books"]);
-    assert_eq!(summary["books"]["roles"]["controller"]["executed"], 902, "what the dead were committed to counts");
+    assert_eq!(summary["books"]["roles"]["controller"]["executed"], 902, "committed ticks of dead roles count");
     bench.assert_clean(&[]);
 }

@@ -1,4 +1,4 @@
-//! Makes samples, processes, system calls, the machine, other users and the input fail, and checks that runs recover or are refused.
+//! Failures of samples, processes, system calls, the machine, other users and the input: runs recover or are refused.
 
 mod bad_input;
 mod environment;

@@ -1,5 +1,4 @@
-//! Bad company: participants of the same run that do everything wrong, and other users. None of them stalls, corrupts or
-//! starves the loop.
+//! Misbehaving participants of a run, and other users: none of them stalls, corrupts or starves the loop.
 
 use crate::common::{Bench, Running, await_some, shipped, skipped};
 use iceoryx2::prelude::*;
@@ -11,19 +10,19 @@ use std::path::{Path, PathBuf};
 
 const LEADER: &str = "corotate/rigid-pair/leader/measurement";
 
-/// The size of a rate measurement, and its name on the wire.
+/// The type name and size of a rate measurement.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
 #[type_name("corotate/rigid-body/measurement/v1#bcfd8b41")]
 struct Measurement([u64; 12]);
 
-/// The same name and another size.
+/// The same name with another size.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
 #[type_name("corotate/rigid-body/measurement/v1#bcfd8b41")]
 struct Short([u64; 11]);
 
-/// The same size and another version.
+/// The same size with another version.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
 #[type_name("corotate/rigid-body/measurement/v999")]
@@ -31,7 +30,7 @@ struct Later([u64; 12]);
 
 type Ipc = ipc::Service;
 
-/// A run under way, and a neighbour's node in its domain.
+/// A running run, and a neighbour's node in its domain.
 struct Visit {
     bench: Bench,
     run: Running,
@@ -41,7 +40,7 @@ struct Visit {
 
 impl Visit {
     fn new(clock: &str) -> Self {
-        // A neighbour that outlives the domain complains of it on the console; that is its right, and not the matter here.
+        // A neighbour that outlives the domain prints errors, which do not matter here.
         set_log_level(LogLevel::Fatal);
         let bench = Bench::new();
         let file = shipped("rigid-pair");
@@ -61,7 +60,7 @@ impl Visit {
         visit
     }
 
-    /// The service by name and type, if it can be opened.
+    /// Opens the service by name and type; `None` if that fails.
     fn service<T: ZeroCopySend + std::fmt::Debug + 'static>(
         &self,
         name: &str,
@@ -74,7 +73,7 @@ impl Visit {
         await_some(|| reader.receive().unwrap().map(|sample| sample.payload().0[0]))
     }
 
-    /// Lets the run go on for a while, ends it, and asserts that it noticed nothing.
+    /// Lets the run continue for a while, ends it, and asserts that it was undisturbed.
     fn assert_unharmed(self) -> Value {
         let before = self.signal_tick();
         await_some(|| (self.signal_tick() > before + 300).then_some(()));
@@ -92,9 +91,9 @@ impl Visit {
 }
 
 #[test]
-fn another_type_version_or_size_is_refused_to_the_neighbour_and_unknown_to_the_loop() {
+fn a_neighbour_with_another_type_version_or_size_is_refused() {
     let visit = Visit::new("realtime");
-    assert!(visit.service::<Measurement>(LEADER).is_some(), "this test is about the others");
+    assert!(visit.service::<Measurement>(LEADER).is_some(), "the right type must open");
     assert!(visit.service::<Short>(LEADER).is_none());
     assert!(visit.service::<Later>(LEADER).is_none());
     assert!(visit.service::<u64>(LEADER).is_none());
@@ -111,9 +110,9 @@ fn a_signal_has_one_publisher() {
     visit.assert_unharmed();
 }
 
-/// A reader that takes samples and never gives them back, and one that never takes any.
+/// One reader takes samples and never returns them, another never takes any.
 #[test]
-fn readers_that_hold_or_ignore_samples_hold_nobody_up() {
+fn readers_that_hold_or_ignore_samples_do_not_delay_the_loop() {
     for clock in ["realtime", "lockstep"] {
         let visit = Visit::new(clock);
         let service = visit.service::<Measurement>(LEADER).unwrap();
@@ -124,35 +123,35 @@ fn readers_that_hold_or_ignore_samples_hold_nobody_up() {
             (held.len() == 2).then_some(())
         });
         let values: Vec<[u64; 12]> = held.iter().map(|sample| sample.payload().0).collect();
-        // As long as it holds them they stay what they were.
+        // Samples that it holds do not change.
         let before = visit.signal_tick();
         await_some(|| (visit.signal_tick() > before + 500).then_some(()));
         assert_eq!(values, held.iter().map(|sample| sample.payload().0).collect::<Vec<_>>());
-        assert!(greedy.receive().is_err(), "more than two are not to be had");
+        assert!(greedy.receive().is_err(), "a reader may hold two samples at most");
         drop((held, greedy, deaf));
         visit.assert_unharmed();
     }
 }
 
-/// As many samples as the machine can send, on a signal of the neighbour's own in the run's domain.
+/// Sends as many samples as the machine can, on a signal of the neighbour in the run's domain.
 #[test]
-fn a_flood_beside_the_loop_is_nobody_s_business() {
+fn a_flood_of_other_samples_does_not_affect_the_loop() {
     let visit = Visit::new("lockstep");
     let name = "corotate/rigid-pair/flood/measurement".try_into().unwrap();
     let service = visit.node.service_builder(&name).publish_subscribe::<Measurement>().create().unwrap();
     let (publisher, _deaf) =
         (service.publisher_builder().create().unwrap(), service.subscriber_builder().create().unwrap());
     for tick in 0..200_000 {
-        // To a reader that never reads, in the transport's default, blocking mode, is what must not happen; ours overflow.
+        // The transport's default mode would block on a reader that never reads; this signal overflows.
         publisher.send_copy(Measurement([tick; 12])).unwrap();
     }
     drop((publisher, service));
     visit.assert_unharmed();
 }
 
-/// A second process for a seat that is taken: it is turned away, and the books stay its owner's.
+/// A second process for a role that is taken is refused, and the counters stay those of the first.
 #[test]
-fn a_seat_is_taken_once() {
+fn a_role_is_taken_once() {
     let visit = Visit::new("realtime");
     for role in [&["observer"][..], &["controller"], &["plant", "--body", "follower"]] {
         let done = visit.bench.run(&[role, &["--domain", visit.domain.to_str().unwrap()]].concat());
@@ -162,29 +161,29 @@ fn a_seat_is_taken_once() {
     visit.assert_unharmed();
 }
 
-/// Everything a run leaves in the file system while it lives is its user's alone.
+/// All files of a running run are private to its user.
 #[test]
-fn nothing_of_a_run_is_open_to_other_users() {
+fn no_file_of_a_run_is_open_to_other_users() {
     let visit = Visit::new("realtime");
     let id = visit.domain.file_name().unwrap().to_str().unwrap().to_owned();
     let shared = std::fs::read_dir("/dev/shm").unwrap().map(|entry| entry.unwrap().path());
     let shared: Vec<PathBuf> = shared.filter(|path| path.to_string_lossy().contains(&id)).collect();
-    assert!(shared.len() > 20, "the signals and books of four roles: {shared:?}");
+    assert!(shared.len() > 20, "the signals and ledgers of four roles: {shared:?}");
     for path in shared.iter().chain([&visit.domain]) {
-        // What is in the domain's directory is behind its mode.
+        // The mode of the domain's directory protects its content.
         let Ok(metadata) = std::fs::metadata(path) else { continue };
         assert_eq!(metadata.mode() & 0o077, 0, "{}: {:o}", path.display(), metadata.mode());
     }
     if rustix::process::getuid().is_root() {
-        another_user_comes_nowhere(&visit, &shared);
+        assert_closed_to_another_user(&visit, &shared);
     } else {
         skipped("what another user can reach", "only root can act as another user");
     }
     visit.assert_unharmed();
 }
 
-/// As nobody, by the program itself and by hand.
-fn another_user_comes_nowhere(visit: &Visit, shared: &[PathBuf]) {
+/// As another user, with the program itself and with a shell.
+fn assert_closed_to_another_user(visit: &Visit, shared: &[PathBuf]) {
     let copy = tempfile::Builder::new().prefix("ct").tempdir_in("/tmp").unwrap();
     let program = copy.path().join("corotate");
     std::fs::copy(env!("CARGO_BIN_EXE_corotate"), &program).unwrap();

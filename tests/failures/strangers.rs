@@ -1,12 +1,13 @@
-//! Another user of the same machine, who does what he can: with directories and files that he has made beforehand, in a race
-//! with the launcher, and in the places that results are written to. Needs root, who can act as two users.
+//! Another user of the same machine as attacker: with directories and files created in advance, in a race with the
+//! launcher, and in the directories of results. Needs root, which can act as two users.
 
 use crate::common::{Bench, Done, await_some, shipped, skipped};
 use std::fs::{self, Permissions};
 use std::os::unix::fs::{MetadataExt, PermissionsExt, chown, lchown, symlink};
 use std::path::Path;
 
-const NOBODY: u32 = 65_534;
+const ATTACKER: u32 = 65_534;
+const ATTACKER_NAME: &str = "nobody";
 const SHORT: [&str; 4] = ["--duration=1", "--clock=lockstep", "--set=accept={}", "--json"];
 
 fn root() -> bool {
@@ -26,9 +27,9 @@ fn run_short(bench: &Bench, arguments: &[&str]) -> Done {
     bench.run(&[&["run", scenario.to_str().unwrap()], &SHORT[..], arguments].concat())
 }
 
-/// Who made the directory of all domains can put anything in it, whatever its mode is now.
+/// The creator of the directory of all domains can put anything in it, whatever its mode is now.
 #[test]
-fn a_directory_that_another_user_made_is_refused_by_all() {
+fn every_command_refuses_a_directory_of_another_user() {
     if !root() {
         return;
     }
@@ -37,29 +38,29 @@ fn a_directory_that_another_user_made_is_refused_by_all() {
     fs::create_dir(&base).unwrap();
     for mode in [0o777, 0o700] {
         set_mode(&base, mode);
-        chown(&base, Some(NOBODY), Some(NOBODY)).unwrap();
-        // What looks like a run of ours.
+        chown(&base, Some(ATTACKER), Some(ATTACKER)).unwrap();
+        // It looks like a run of ours.
         let domain = base.join("0123456789abcdef0123456789abcdef");
         fs::create_dir_all(&domain).unwrap();
         for file in [domain.join("scenario.toml"), domain.with_extension("lock")] {
             fs::copy(shipped("rigid-pair"), &file).unwrap();
         }
         set_mode(&domain, 0o700);
-        let refusal = format!("{} belongs to nobody (uid {NOBODY}), not to root (uid 0)", base.display());
+        let refusal = format!("{} belongs to {ATTACKER_NAME} (uid {ATTACKER}), not to root (uid 0)", base.display());
         let watched = ["watch", "--once", "1"];
         for (code, done) in
             [(1, run_short(&bench, &[])), (2, bench.run(&watched)), (3, bench.run(&["doctor", "--seconds=0"]))]
         {
-            let told = format!("{}{}", done.stdout, done.stderr);
-            assert!(done.code == Some(code) && told.contains(&refusal), "{code}: {done:?}");
-            assert!(told.contains("set it to a directory of your own"), "{done:?}");
+            let output = format!("{}{}", done.stdout, done.stderr);
+            assert!(done.code == Some(code) && output.contains(&refusal), "{code}: {done:?}");
+            assert!(output.contains("set it to a directory of your own"), "{done:?}");
         }
         let named = ["watch", "--once", "1", domain.to_str().unwrap()];
         let done = bench.run(&named);
         assert!(done.code != Some(0) && done.says("exposed-directory"), "{done:?}");
         fs::remove_dir_all(&domain).unwrap();
     }
-    // One of ours that others can write to, or replace.
+    // A directory of ours that other users can write to or replace.
     chown(&base, Some(0), Some(0)).unwrap();
     set_mode(&base, 0o770);
     let done = run_short(&bench, &[]);
@@ -72,7 +73,8 @@ fn a_directory_that_another_user_made_is_refused_by_all() {
     assert_eq!(run_short(&bench, &[]).code, Some(0));
 }
 
-/// Plants what he can as soon as the first file of a run shows, and opens whatever lets him. Tells at the end.
+/// Creates hostile files as soon as the first file of a run appears, and opens everything it can. Prints a summary at
+/// the end.
 const RACER: &str = r#"
 import json, os, signal, sys
 secret, attacker, stopped = sys.argv[1], int(sys.argv[2]), False
@@ -114,7 +116,7 @@ while not stopped:
 print(json.dumps({"seen": len(seen), "planted": planted, "opened": opened}))
 "#;
 
-/// In a /dev/shm of their own: what the attacker plants is his, and would be in the way of others.
+/// In a private /dev/shm: the attacker's files would disturb other tests.
 fn raced(victim: u32, runs: u32) {
     let bench = Bench::new();
     let at = |name: &str| bench.path(name).to_str().unwrap().to_owned();
@@ -129,8 +131,8 @@ fn raced(victim: u32, runs: u32) {
     set_mode(&bench.path(""), 0o755);
     let script = format!(
         "mount -t tmpfs -o mode=1777 tmpfs /dev/shm || exit 77
-        python3 racer.py {secret} {NOBODY} > told & racer=$!
-        until grep -q ready told; do sleep 0.01; done
+        python3 racer.py {secret} {ATTACKER} > attack & racer=$!
+        until grep -q ready attack; do sleep 0.01; done
         for number in $(seq {runs}); do
             setpriv --reuid={victim} --regid={victim} --clear-groups ./corotate run pair.toml {short} --record --out out$number > out$number.json || echo failed $?
         done
@@ -144,11 +146,11 @@ fn raced(victim: u32, runs: u32) {
         return skipped("a race with another user", "a mount of a /dev/shm of one's own is forbidden");
     }
     assert!(done.code == Some(0) && done.stdout.is_empty(), "every run is accepted, nothing is left: {done:?}");
-    let told = fs::read_to_string(at("told")).unwrap();
-    let told: serde_json::Value = serde_json::from_str(told.lines().last().unwrap()).unwrap();
-    println!("uid {victim}: {told}");
-    assert!(told["seen"].as_u64() >= Some(1) && told["planted"].as_u64() >= Some(1), "{told}");
-    assert_eq!(told["opened"].as_array().map(Vec::len), Some(0), "{told}");
+    let attack = fs::read_to_string(at("attack")).unwrap();
+    let attack: serde_json::Value = serde_json::from_str(attack.lines().last().unwrap()).unwrap();
+    println!("uid {victim}: {attack}");
+    assert!(attack["seen"].as_u64() >= Some(1) && attack["planted"].as_u64() >= Some(1), "{attack}");
+    assert_eq!(attack["opened"].as_array().map(Vec::len), Some(0), "{attack}");
     let secret = fs::metadata(at("secret")).unwrap();
     assert_eq!((secret.mode() & 0o777, fs::read_to_string(at("secret")).unwrap().as_str()), (0o640, "kept"));
     for number in 1..=runs {
@@ -159,7 +161,7 @@ fn raced(victim: u32, runs: u32) {
 }
 
 #[test]
-fn whoever_races_the_launcher_finds_nothing_open_and_is_in_nobodys_way() {
+fn an_attacker_that_races_the_launcher_opens_nothing_and_stops_no_run() {
     if !root() {
         return;
     }
@@ -168,9 +170,9 @@ fn whoever_races_the_launcher_finds_nothing_open_and_is_in_nobodys_way() {
     raced(54_321, runs);
 }
 
-/// Where he can write, names lead where he wants: through none of them is anything written.
+/// In a directory where the attacker can write, links lead to his targets: nothing is written through them.
 #[test]
-fn results_are_written_through_no_link_of_another_user() {
+fn results_are_not_written_through_links_of_another_user() {
     if !root() {
         return;
     }
@@ -185,7 +187,7 @@ fn results_are_written_through_no_link_of_another_user() {
     for (target, link) in [("file", "file"), ("", "directory"), ("new", "new"), ("file", "leader.truth.csv")] {
         let link = at(&format!("open/{link}"));
         symlink(secrets.join(target), &link).unwrap();
-        lchown(link, Some(NOBODY), Some(NOBODY)).unwrap();
+        lchown(link, Some(ATTACKER), Some(ATTACKER)).unwrap();
     }
     let scenario = shipped("rigid-pair");
     let scenario = scenario.to_str().unwrap();
@@ -207,15 +209,15 @@ fn results_are_written_through_no_link_of_another_user() {
     ] {
         let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
         let done = bench.run(&arguments);
-        let told = format!("{link} is a link of nobody (uid {NOBODY}), and is not followed");
-        assert!(done.code == Some(1) && done.stderr.contains(&told), "{arguments:?}: {done:?}");
+        let refusal = format!("{link} is a link of {ATTACKER_NAME} (uid {ATTACKER}), and is not followed");
+        assert!(done.code == Some(1) && done.stderr.contains(&refusal), "{arguments:?}: {done:?}");
     }
-    // A table takes the place of the link, not of what it leads to.
+    // A table replaces the link, not its target.
     bench.run(&["export", &recording, "--csv", &at("open")]).succeeded();
     assert!(fs::symlink_metadata(at("open/leader.truth.csv")).unwrap().is_file());
     assert_eq!(fs::read_to_string(secrets.join("file")).unwrap(), "kept");
     assert_eq!(fs::read_dir(&secrets).unwrap().count(), 1);
-    // A run's directory with a file that is a link is refused as one that is not ours.
+    // A run's directory with a link in place of a file is refused.
     symlink(secrets.join("file"), at("open/summary.json")).unwrap();
     let done = run_short(&bench, &["--out", &at("open")]);
     assert!(done.code != Some(0) && done.says("foreign-file"), "{done:?}");

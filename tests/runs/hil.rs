@@ -312,7 +312,7 @@ fn a_waiting_run_leaves_the_seat_that_the_command_prints_and_ends_in_order() {
     assert_eq!(printed.code, Some(0));
     let other = bench.run(&["seat", file("pair.toml").to_str().unwrap(), "follower", "--domain", domain]);
     assert_eq!((other.code, other.stdout.as_str()), (Some(2), ""), "{other:?}");
-    assert!(other.stderr.contains(&format!("give its own file, {own}")), "{other:?}");
+    assert!(other.stderr.contains(&format!("give its scenario file, {own}")), "{other:?}");
     running.signal(SIGINT);
     let done = running.wait();
     assert_eq!(done.code, Some(128 + SIGINT), "{done:?}");

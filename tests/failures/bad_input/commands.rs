@@ -1,4 +1,4 @@
-//! Files, overrides, options and command lines that make no sense, and what `corotate check` prints beside them.
+//! Invalid files, overrides, options and command lines; and the output of `corotate check` beside them.
 
 use super::{FILE, PAIR, assert_says, place, refused, refused_in, with};
 use crate::common::{Bench, code_of, shipped};
@@ -6,7 +6,7 @@ use corotate::config::SHIPPED;
 use corotate::scenario::Scenario;
 
 #[test]
-fn what_is_no_file_is_refused() {
+fn a_path_without_a_file_is_refused() {
     let bench = Bench::new();
     std::fs::create_dir(bench.path("directory")).unwrap();
     std::fs::write(bench.path("file"), PAIR).unwrap();
@@ -21,7 +21,7 @@ fn what_is_no_file_is_refused() {
         ] {
             let done = refused_in(&bench, &[command, path]);
             assert!(done.stderr.starts_with(&format!("corotate: {path}: ")) && done.says(code), "{done:?}");
-            // An empty text lacks every key that must be there.
+            // An empty text lacks every required key.
             let findings = if path == "/dev/null" { 4 } else { 1 };
             assert!(done.stdout.is_empty() && done.stderr.lines().count() == findings, "{done:?}");
         }
@@ -156,11 +156,11 @@ fn parquet_that_was_left_out_of_the_build_is_refused() {
 }
 
 #[test]
-fn a_command_line_that_makes_no_sense_is_refused() {
+fn an_invalid_command_line_is_refused() {
     let bench = Bench::new();
     let path = bench.path("");
     let pair = shipped("rigid-pair").display().to_string();
-    // An error of clap names the word and points to the help.
+    // A clap error names the word and points to the help.
     let words: [(&[&str], &str); 16] = [
         (&["nosuch"], "'nosuch'"),
         (&["--nosuch"], "'--nosuch'"),
@@ -204,7 +204,7 @@ fn a_command_line_that_makes_no_sense_is_refused() {
 }
 
 #[test]
-fn check_prints_the_good_among_the_bad() {
+fn check_prints_the_valid_files_beside_invalid_ones() {
     let bench = Bench::new();
     std::fs::write(bench.path("good.toml"), PAIR).unwrap();
     let bad = with(PAIR, "tick_hz", "0");
@@ -219,7 +219,7 @@ fn check_prints_the_good_among_the_bad() {
 }
 
 #[test]
-fn what_check_prints_is_the_scenario_it_checked() {
+fn check_prints_the_scenario_that_it_checked() {
     let bench = Bench::new();
     for (name, text) in SHIPPED {
         let path = shipped(name);
@@ -233,7 +233,7 @@ fn what_check_prints_is_the_scenario_it_checked() {
         let resolved = Scenario::load(&path, &[]).unwrap().to_toml();
         assert_eq!(Scenario::parse(&done.stdout, name, &[]).unwrap().to_toml(), resolved);
         assert_eq!(Scenario::parse(&resolved, name, &[]).unwrap().to_toml(), resolved);
-        // A file that it names is built in under its name alone.
+        // A file that the scenario names is built in under its own name.
         let beside = format!("{}/", path.parent().unwrap().display());
         let resolved = resolved.replace(&beside, "");
         assert_eq!(Scenario::parse(text, name, &[]).unwrap().to_toml(), resolved, "as built in");
@@ -241,7 +241,7 @@ fn what_check_prints_is_the_scenario_it_checked() {
 }
 
 #[test]
-fn a_stdout_that_takes_nothing_is_a_failure_and_no_panic() {
+fn a_full_stdout_is_an_error_and_not_a_panic() {
     let pair = shipped("rigid-pair");
     for arguments in [["init", "rigid-pair"], ["check", pair.to_str().unwrap()]] {
         let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
@@ -252,9 +252,9 @@ fn a_stdout_that_takes_nothing_is_a_failure_and_no_panic() {
     }
 }
 
-/// Of the scenario's own sections and of the rig's, each with its line.
+/// Mistakes in the scenario's sections and in the rig's, each with its line.
 #[test]
-fn all_mistakes_are_told_at_once_with_their_lines() {
+fn all_mistakes_are_reported_at_once_with_their_lines() {
     let bench = Bench::new();
     let mut text = PAIR.to_owned();
     let changes = [
@@ -273,10 +273,10 @@ fn all_mistakes_are_told_at_once_with_their_lines() {
     let done = refused_in(&bench, &["run", FILE]);
     for (number, line) in numbers {
         let (at, quote) = (format!("corotate: {FILE}:{number}: "), format!("corotate: {number:>4} | {line}"));
-        let told: Vec<&str> = done.stderr.lines().collect();
-        assert!(told.windows(2).any(|pair| pair[0].starts_with(&at) && pair[1] == quote), "{at}: {done:?}");
+        let lines: Vec<&str> = done.stderr.lines().collect();
+        assert!(lines.windows(2).any(|pair| pair[0].starts_with(&at) && pair[1] == quote), "{at}: {done:?}");
     }
-    // What is misspelt is not missing too, and nothing is told twice.
+    // A misspelt key is not reported as missing too, and no mistake is reported twice.
     assert_eq!(done.stderr.lines().count(), 2 * changes.len(), "{done:?}");
     std::fs::write(bench.path(FILE), with(&with(PAIR, "rig", "\"rigidbody\""), "clock", "7")).unwrap();
     let done = refused_in(&bench, &["run", FILE]);

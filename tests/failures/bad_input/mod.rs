@@ -1,7 +1,8 @@
-//! Holds the program to its word on bad input: exit code 2, one clear message with place, key, reason and remedy; nothing
-//! started, nothing left. Whatever the text, the parser answers and never panics.
+//! Bad input gives exit code 2 and one clear message with place, key, reason and remedy; nothing is started and nothing
+//! is left. The parser answers to any text and never panics.
 //!
-//! Most cases change one line of the shipped scenario rigid-pair; the line that must be named is found in the changed text.
+//! Most cases change one line of the shipped scenario rigid-pair; the expected line number is found in the changed
+//! text.
 
 mod commands;
 mod random;
@@ -11,15 +12,15 @@ mod values;
 use crate::common::{Bench, Done, code_of};
 use std::path::PathBuf;
 
-/// The text that is spoilt.
+/// The text that the tests change.
 const PAIR: &str = include_str!("../../../config/rigid-pair.toml");
-/// The name that it is given, as messages must name it.
+/// Its file name in messages.
 const FILE: &str = "bad.toml";
 
-/// A key, the value that it is set to, and the code of the mistake.
+/// A key, an invalid value, and the expected error code.
 type Row = (&'static str, &'static str, &'static str);
 
-/// The line numbers, from 1, and paths of all keys and tables of a text that is laid out as the shipped ones.
+/// Returns line number (from 1) and path of every key and table of a text in the layout of the shipped ones.
 fn paths(text: &str) -> Vec<(usize, String)> {
     let mut found: Vec<(usize, String)> = Vec::new();
     let mut table = String::new();
@@ -38,13 +39,13 @@ fn paths(text: &str) -> Vec<(usize, String)> {
     found
 }
 
-/// The keys of the spoilt text, without its tables.
+/// Returns the keys of the text, without its tables.
 fn keys() -> Vec<String> {
     let is_key = |number: usize| !line(number).starts_with('[');
     paths(PAIR).into_iter().filter(|(number, _)| is_key(*number)).map(|(_, path)| path).collect()
 }
 
-/// A line of the spoilt text.
+/// Returns a line of the text.
 fn line(number: usize) -> &'static str {
     PAIR.lines().nth(number - 1).unwrap()
 }
@@ -53,19 +54,19 @@ fn line_of(text: &str, key: &str) -> Option<usize> {
     paths(text).into_iter().find(|(_, path)| path == key).map(|(number, _)| number)
 }
 
-/// The table that a key belongs to, and its name there.
+/// Splits a key into its table and its name there.
 fn split(key: &str) -> (Option<&str>, &str) {
     key.rsplit_once('.').map_or((None, key), |(table, name)| (Some(table), name))
 }
 
-/// The text with another line in the place of one, or more lines, or none.
+/// Returns the text with one line replaced by any number of lines.
 fn replace(text: &str, number: usize, by: &[&str]) -> String {
     let mut lines: Vec<&str> = text.lines().collect();
     lines.splice(number - 1..number, by.iter().copied());
     lines.join("\n") + "\n"
 }
 
-/// The text with one key set to a value, in its place or as the first of its table.
+/// Returns the text with one key set to a value, in its place or first in its table.
 fn with(text: &str, key: &str, value: &str) -> String {
     let (table, name) = split(key);
     let line = format!("{name} = {value}");
@@ -79,7 +80,7 @@ fn with(text: &str, key: &str, value: &str) -> String {
     }
 }
 
-/// The text without a table and its keys, every other line where it was.
+/// Returns the text without a table and its keys; all other lines keep their numbers.
 fn without_table(table: &str) -> String {
     let of_table = |path: &str| path == table || path.starts_with(&format!("{table}."));
     let gone: Vec<usize> =
@@ -88,7 +89,7 @@ fn without_table(table: &str) -> String {
     (1..).zip(PAIR.lines()).map(keep).collect::<Vec<_>>().join("\n")
 }
 
-/// Where a message must say that a key is: its line, its table's line, or the file.
+/// Returns the place that a message must name for a key: its line, its table's line, or the file.
 fn place(text: &str, key: &str) -> String {
     let around = std::iter::successors(Some(key), |key| key.rfind(['.', '[']).map(|end| &key[..end]));
     match around.into_iter().find_map(|key| line_of(text, key)) {
@@ -97,7 +98,7 @@ fn place(text: &str, key: &str) -> String {
     }
 }
 
-/// Everything that a bench's directory and runtime directory hold.
+/// Returns all paths in a bench's directory and runtime directory.
 fn contents(bench: &Bench) -> Vec<PathBuf> {
     let command = bench.command();
     let runtime = command.get_envs().find(|(name, _)| *name == "XDG_RUNTIME_DIR").and_then(|(_, value)| value).unwrap();
@@ -105,20 +106,20 @@ fn contents(bench: &Bench) -> Vec<PathBuf> {
     directories.iter().flat_map(|path| std::fs::read_dir(path).unwrap()).map(|entry| entry.unwrap().path()).collect()
 }
 
-/// Runs what must be refused before anything is started, and returns what it says.
+/// Runs a command that must be refused before anything is started.
 fn refused_in(bench: &Bench, arguments: &[&str]) -> Done {
     let before = contents(bench);
     let done = bench.run(arguments);
     assert_eq!(done.code, Some(2), "{done:?}");
     assert!(!done.stderr.is_empty() && !done.stderr.contains("panicked"), "{done:?}");
-    // A message that fills the screen, or paints on it, is not clear.
+    // A clear message is short and has no control characters.
     assert!(done.stderr.lines().all(|line| line.len() < 2000 && !line.contains(char::is_control)), "{done:?}");
-    assert_eq!(contents(bench), before, "something was left");
-    assert!(bench.processes().is_empty(), "something was started and still runs");
+    assert_eq!(contents(bench), before, "a file was left");
+    assert!(bench.processes().is_empty(), "a process still runs");
     done
 }
 
-/// Runs a text that must be refused, and returns the lines that say why.
+/// Runs a text that must be refused, and returns the lines of the message.
 fn refused(text: impl AsRef<[u8]>, arguments: &[&str]) -> Vec<String> {
     let bench = Bench::new();
     std::fs::write(bench.path(FILE), text).unwrap();
@@ -133,25 +134,25 @@ fn refused(text: impl AsRef<[u8]>, arguments: &[&str]) -> Vec<String> {
     lines
 }
 
-/// Whether a line of a message quotes the file's: its number, and what it says.
+/// Returns true if a line quotes the file: line number and content.
 fn is_quote(line: &str) -> bool {
     let number = line.strip_prefix("corotate: ").and_then(|line| line.split_once(" | "));
     number.is_some_and(|(number, _)| number.trim().parse::<usize>().is_ok())
 }
 
-/// Asserts that one of the lines is of a place and has a code.
+/// Asserts that one of the lines begins with a place and has a code.
 fn assert_says(lines: &[String], start: &str, code: &str) {
     let says = |line: &String| line.starts_with(start) && code_of(line) == Some(code);
     assert!(lines.iter().any(says), "expected {start:?} and {code}, got {lines:#?}");
     assert!(lines.iter().all(|line| code_of(line).is_some()), "no code: {lines:#?}");
 }
 
-/// Asserts that a text is refused for one key, in the right place.
+/// Asserts that a text is refused for one key at the right place.
 fn assert_refused(text: &str, key: &str, code: &str) {
     assert_says(&refused(text, &[]), &format!("corotate: {}: {key}", place(text, key)), code);
 }
 
-/// Asserts the same of a word that is like one that is known.
+/// Asserts that a text is refused for one key, with a suggestion.
 fn assert_suggests(text: &str, key: &str, code: &str, meant: &str) {
     let lines = refused(text, &[]);
     assert_says(&lines, &format!("corotate: {}: {key}", place(text, key)), code);

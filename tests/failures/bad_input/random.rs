@@ -1,4 +1,4 @@
-//! Random texts, bytes and overrides: the parser answers with a scenario or a message, and never panics.
+//! Random texts, bytes and overrides: the parser returns a scenario or a message, and never panics.
 
 use super::{FILE, keys};
 use corotate::config::SHIPPED;
@@ -7,7 +7,7 @@ use proptest::prelude::*;
 use proptest::sample::{Index, select};
 use proptest::test_runner::RngSeed;
 
-/// One way in which a text goes wrong.
+/// One random change of a text.
 #[derive(Debug, Clone)]
 enum Slip {
     DeleteLine(Index),
@@ -45,7 +45,7 @@ impl Slip {
     }
 }
 
-/// The text with one of the numbers that stand after ` = ` or in a list replaced.
+/// Returns the text with one of the numbers after ` = ` or in a list replaced.
 fn replace_number(text: &str, at: &Index, number: &str) -> String {
     let begins = |(offset, c): &(usize, char)| c.is_ascii_digit() && text[..*offset].ends_with([' ', '[', '-']);
     let begin: Vec<usize> = text.char_indices().filter(begins).map(|(offset, _)| offset).collect();
@@ -60,8 +60,8 @@ fn replace_number(text: &str, at: &Index, number: &str) -> String {
 fn number() -> impl Strategy<Value = &'static str> {
     let numbers = "0 -1 1 2 3 1e3 1e-3 1e9 1e308 1e-320 1e400 nan inf -inf 0x7fff 1_000 9223372036854775807 \
                    -9223372036854775808 18446744073709551615 99999999999999999999";
-    let others = "\"1\" true [] [[]] {} 1979-05-27 ' ,";
-    select(numbers.split(' ').chain(others.split(' ')).collect::<Vec<_>>())
+    let not_numbers = "\"1\" true [] [[]] {} 1979-05-27 ' ,";
+    select(numbers.split(' ').chain(not_numbers.split(' ')).collect::<Vec<_>>())
 }
 
 fn slip() -> impl Strategy<Value = Slip> {
@@ -75,7 +75,7 @@ fn slip() -> impl Strategy<Value = Slip> {
     ]
 }
 
-/// Overrides of keys that exist, of such that do not, and of nothing that can be read.
+/// Returns overrides of existing keys, of unknown keys, and unreadable ones.
 fn argument() -> impl Strategy<Value = String> {
     let key = prop_oneof![
         select(keys()),
@@ -86,7 +86,7 @@ fn argument() -> impl Strategy<Value = String> {
     prop_oneof![9 => (key, value).prop_map(|(key, value)| format!("{key}={value}")), 1 => any::<String>()]
 }
 
-/// The shipped texts, spoilt; now and then not at all, so that overrides alone are at fault.
+/// Returns the shipped texts with random changes, sometimes none, so that overrides alone are wrong.
 fn spoilt() -> impl Strategy<Value = String> {
     let text = select(SHIPPED.map(|(_, text)| text).to_vec());
     (text, prop::collection::vec(slip(), 0..4))
@@ -102,7 +102,7 @@ proptest! {
     })]
 
     #[test]
-    fn whatever_the_text_and_the_overrides_the_answer_is_a_scenario_or_a_message(
+    fn any_text_with_any_overrides_gives_a_scenario_or_a_message(
         text in spoilt(),
         overrides in prop::collection::vec(argument(), 0..3),
     ) {
@@ -123,7 +123,7 @@ proptest! {
     }
 
     #[test]
-    fn whatever_the_bytes_the_answer_is_a_message(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+    fn any_bytes_give_a_message(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
         let message = Scenario::parse(&String::from_utf8_lossy(&bytes), FILE, &[]).unwrap_err().to_string();
         prop_assert!(message.starts_with(FILE), "{}", message);
     }

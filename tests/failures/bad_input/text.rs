@@ -1,4 +1,4 @@
-//! Texts that are no scenario: types, names, tables and syntax.
+//! Texts that are not scenarios: wrong types, names, tables and syntax.
 
 use super::{
     FILE, PAIR, assert_refused, assert_says, assert_suggests, keys, line, line_of, place, refused, refused_in, replace,
@@ -22,7 +22,7 @@ fn every_key_refuses_every_other_type() {
                 let start = format!("corotate: {}: {key}", place(&text, &key));
                 assert!(lines[0].starts_with(&start) && code_of(&lines[0]).is_some(), "{key} = {wrong}: {lines:?}");
                 let jargon = ["f64", "u64", "i32", "usize", "struct", "sequence", "map", "variant", "invalid type"];
-                assert!(!jargon.iter().any(|word| lines[0].contains(word)), "for Rust programmers only: {lines:?}");
+                assert!(!jargon.iter().any(|word| lines[0].contains(word)), "jargon: {lines:?}");
             }
         }
     }
@@ -58,7 +58,7 @@ fn a_misspelt_key_is_refused_with_the_right_one_in_every_table() {
 }
 
 #[test]
-fn a_key_that_is_like_none_is_refused_with_all_there_are() {
+fn an_unknown_key_is_refused_with_a_list_of_all_keys() {
     for key in
         ["zzz", "leader.zzz", "follower[0].zzz", "observer.zzz", "controller.zzz", "actuator.zzz", "realtime.zzz"]
     {
@@ -75,7 +75,7 @@ fn a_key_that_is_like_none_is_refused_with_all_there_are() {
 }
 
 #[test]
-fn a_key_or_table_that_is_missing_is_asked_for() {
+fn a_missing_key_or_table_is_named() {
     let needed = [
         "name",
         "rig",
@@ -102,9 +102,9 @@ fn a_key_or_table_that_is_missing_is_asked_for() {
         let done = refused_in(&bench, &["run", FILE]);
         assert_eq!(done.codes(), ["missing-key"; 4]);
         let keys = ["name", "rig", "tick_hz", "duration_s"];
-        let told =
+        let named =
             done.stderr.lines().zip(keys).all(|(line, key)| line.starts_with(&format!("corotate: {FILE}: {key}: ")));
-        assert!(told && done.stderr.lines().count() == keys.len(), "{done:?}");
+        assert!(named && done.stderr.lines().count() == keys.len(), "{done:?}");
     }
 }
 
@@ -126,7 +126,7 @@ fn a_key_or_table_that_appears_twice_is_refused() {
 }
 
 #[test]
-fn a_table_is_a_table_and_a_list_is_a_list() {
+fn a_table_and_a_list_are_not_interchangeable() {
     for table in ["leader", "observer", "controller", "actuator", "realtime", "launch", "accept"] {
         let listed = PAIR.replace(&format!("\n[{table}]"), &format!("\n[[{table}]]"));
         let start = format!("corotate: {FILE}:{}: {table}: ", line_of(PAIR, table).unwrap());
@@ -134,7 +134,7 @@ fn a_table_is_a_table_and_a_list_is_a_list() {
         let plain = format!("{table} = 3\n{}", without_table(table));
         assert_refused(&plain, table, "wrong-type");
     }
-    // Values without their keys, in the order of the program's own structures.
+    // Values without keys, in the order of the program's own structures.
     let bare = format!("leader = [[1.0, 2.0, 2.5], [0.6, -0.4, 0.8], [1, 2]]\n{}", without_table("leader"));
     assert_refused(&bare, "leader", "wrong-type");
     let single = PAIR.replace("[[follower]]", "[follower]");
@@ -146,7 +146,7 @@ fn a_table_is_a_table_and_a_list_is_a_list() {
 }
 
 #[test]
-fn the_line_is_right_however_the_text_is_laid_out() {
+fn the_line_is_right_for_every_layout() {
     let at = line_of(PAIR, "leader.inertia_kg_m2").unwrap();
     let spread = replace(PAIR, at, &["inertia_kg_m2 = [", "  1.0,", "  nan,", "  2.5,", "]"]);
     assert_says(
@@ -164,7 +164,7 @@ fn the_line_is_right_however_the_text_is_laid_out() {
 }
 
 #[test]
-fn what_is_no_toml_is_refused_at_its_line() {
+fn invalid_toml_is_refused_at_its_line() {
     for (key, line) in [
         ("clock", "clock = \"realtime"),
         ("clock", "clock ="),
@@ -185,7 +185,7 @@ fn what_is_no_toml_is_refused_at_its_line() {
 }
 
 #[test]
-fn what_is_no_text_is_refused_at_its_line() {
+fn invalid_utf8_is_refused_at_its_line() {
     let bytes: Vec<u8> = (0..=255).cycle().take(4096).collect();
     assert_says(&refused(bytes, &[]), &format!("corotate: {FILE}:2:"), "not-utf8");
     assert_says(&refused(b"name = \"\xff\"\n", &[]), &format!("corotate: {FILE}:1:9: "), "not-utf8");
@@ -200,7 +200,7 @@ fn what_is_no_text_is_refused_at_its_line() {
 }
 
 #[test]
-fn a_text_may_nest_as_deep_as_it_likes() {
+fn deep_nesting_is_handled() {
     let deep = |open: &str, close: &str| format!("x = {}{}\n", open.repeat(50_000), close.repeat(50_000));
     let dotted = vec!["a"; 50_000].join(".");
     for text in [
@@ -219,7 +219,7 @@ fn a_text_may_nest_as_deep_as_it_likes() {
 }
 
 #[test]
-fn a_line_may_be_as_long_as_it_likes() {
+fn long_lines_are_handled() {
     let long = "x".repeat(900_000);
     let comment = format!("# {long}\n{}", with(PAIR, "tick_hz", "0"));
     assert_refused(&comment, "tick_hz", "out-of-range");

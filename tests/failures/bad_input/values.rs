@@ -1,4 +1,4 @@
-//! Values that make no sense: what each key can be.
+//! Invalid values: the range of each key.
 
 use super::{
     FILE, PAIR, assert_all_refused, assert_refused, assert_says, assert_suggests, keys, line, line_of, place, refused,
@@ -9,7 +9,7 @@ use corotate::config::SHIPPED;
 use corotate::scenario::Scenario;
 
 #[test]
-fn a_name_a_rig_and_a_clock_are_what_they_can_be() {
+fn an_invalid_name_rig_or_clock_is_refused() {
     let long = format!("\"{}\"", "a".repeat(200));
     assert_refused(&with(PAIR, "name", &long), "name", "bad-name");
     assert_refused(&with(PAIR, "follower[0].name", &long), "follower[0].name", "bad-name");
@@ -32,7 +32,7 @@ fn a_name_a_rig_and_a_clock_are_what_they_can_be() {
 }
 
 #[test]
-fn a_word_that_is_misspelt_is_told_the_right_one() {
+fn a_misspelt_word_is_refused_with_a_suggestion() {
     for (key, value, code, meant) in [
         ("rig", "\"rigid-bodi\"", "unknown-rig", "rigid-body"),
         ("clock", "\"lokstep\"", "unknown-choice", "lockstep"),
@@ -45,7 +45,7 @@ fn a_word_that_is_misspelt_is_told_the_right_one() {
 }
 
 #[test]
-fn a_tick_and_a_length_are_within_what_can_be_run() {
+fn a_tick_rate_or_duration_out_of_range_is_refused() {
     assert_all_refused(&[
         ("tick_hz", "0", "out-of-range"),
         ("tick_hz", "0.0", "out-of-range"),
@@ -62,7 +62,7 @@ fn a_tick_and_a_length_are_within_what_can_be_run() {
 }
 
 #[test]
-fn nothing_else_is_said_of_a_tick_that_cannot_be() {
+fn an_invalid_tick_rate_gives_one_message_only() {
     for tick_hz in ["0", "-5", "0.01", "1e-9", "1e7"] {
         assert_eq!(refused(with(PAIR, "tick_hz", tick_hz), &[]).len(), 1, "{tick_hz}");
         for (name, text) in SHIPPED {
@@ -73,7 +73,7 @@ fn nothing_else_is_said_of_a_tick_that_cannot_be() {
 }
 
 #[test]
-fn nothing_else_is_said_of_a_length_that_cannot_be() {
+fn an_invalid_duration_gives_one_message_only() {
     for duration_s in ["0", "-5", "1e-9", "1e12"] {
         assert_eq!(refused(with(PAIR, "duration_s", duration_s), &[]).len(), 1, "{duration_s}");
         for (name, text) in SHIPPED {
@@ -84,7 +84,7 @@ fn nothing_else_is_said_of_a_length_that_cannot_be() {
 }
 
 #[test]
-fn a_leader_is_a_body_with_one_hidden_axis() {
+fn a_leader_without_exactly_one_hidden_axis_is_refused() {
     assert_all_refused(&[
         ("leader.inertia_kg_m2", "[0.0, 2.0, 2.5]", "no-such-inertia"),
         ("leader.inertia_kg_m2", "[1.0, -2.0, 2.5]", "no-such-inertia"),
@@ -111,7 +111,7 @@ fn a_leader_is_a_body_with_one_hidden_axis() {
 }
 
 #[test]
-fn no_shipped_scenario_takes_an_axis_that_no_body_has() {
+fn every_shipped_scenario_refuses_an_unknown_axis() {
     for (name, text) in SHIPPED {
         for key in ["leader.measured_axes", "leader.outage[0].axis", "observer.symmetry_axis"] {
             let values: &[&str] = if key.ends_with("axes") {
@@ -128,7 +128,7 @@ fn no_shipped_scenario_takes_an_axis_that_no_body_has() {
 }
 
 #[test]
-fn nothing_is_said_of_a_rig_s_criteria_where_there_is_no_rig() {
+fn criteria_are_not_checked_without_a_valid_rig() {
     for (key, value) in [("leader.inertia_kg_m2", "[0.0, 2.0, 2.5]"), ("leader.measured_axes", "[]"), ("rig", "\"x\"")]
     {
         assert_eq!(refused(with(PAIR, key, value), &[]).len(), 1, "{key}");
@@ -136,7 +136,7 @@ fn nothing_is_said_of_a_rig_s_criteria_where_there_is_no_rig() {
 }
 
 #[test]
-fn followers_have_names_of_their_own() {
+fn follower_names_must_be_unique() {
     assert_all_refused(&[
         ("follower[0].name", "\"\"", "bad-name"),
         ("follower[0].name", "\"Leader One\"", "bad-name"),
@@ -151,7 +151,7 @@ fn followers_have_names_of_their_own() {
 }
 
 #[test]
-fn there_are_as_many_followers_as_a_run_can_hold() {
+fn a_run_without_followers_or_with_too_many_is_refused() {
     let none = without_table("follower[0]");
     for text in [format!("follower = []\n{none}"), none] {
         assert_says(&refused(text, &[]), &format!("corotate: {FILE}"), "unused-key");
@@ -163,7 +163,7 @@ fn there_are_as_many_followers_as_a_run_can_hold() {
 }
 
 #[test]
-fn an_observer_and_a_controller_can_do_their_work() {
+fn unusable_observers_and_controllers_are_refused() {
     assert_all_refused(&[
         ("observer.decay_rate_per_s", "0", "not-positive"),
         ("observer.decay_rate_per_s", "-6.0", "not-positive"),
@@ -183,12 +183,12 @@ fn an_observer_and_a_controller_can_do_their_work() {
 }
 
 #[test]
-fn nothing_turns_too_far_in_one_tick() {
+fn a_turn_too_far_for_one_tick_is_refused() {
     let fast = with(PAIR, "leader.initial_rate_rad_s", "[60.0, -40.0, 80.0]");
     assert_refused(&with(&fast, "tick_hz", "0.2"), "tick_hz", "ambiguous-phase");
     let fast = with(PAIR, "follower[0].initial_rate_rad_s", "[1e9, 0.0, 0.0]");
     assert_refused(&fast, "follower[0].initial_rate_rad_s", "turns-too-far");
-    // On a hyperbola no phase comes round, but nothing follows such a motion either.
+    // On a hyperbola the phase is not periodic, but no follower could track such a motion either.
     let hyperbolic = std::fs::read_to_string(shipped("rigid-pair-hyperbolic")).unwrap();
     let fast = with(&hyperbolic, "leader.initial_rate_rad_s", "[1e5, 1e5, 1e5]");
     assert_refused(&fast, "tick_hz", "ambiguous-phase");
@@ -197,7 +197,7 @@ fn nothing_turns_too_far_in_one_tick() {
 }
 
 #[test]
-fn actuators_real_time_and_launch_have_limits() {
+fn actuator_realtime_and_launch_keys_out_of_range_are_refused() {
     assert_all_refused(&[
         ("actuator.command_timeout_ticks", "0", "out-of-range"),
         ("actuator.command_timeout_ticks", "-1", "wrong-type"),
@@ -238,7 +238,7 @@ fn actuators_real_time_and_launch_have_limits() {
 }
 
 #[test]
-fn criteria_are_known_and_can_be_met() {
+fn unknown_and_unattainable_criteria_are_refused() {
     assert_all_refused(&[
         ("accept.settled_by_s", "-1", "negative"),
         ("accept.settled_by_s", "\"8 s\"", "wrong-type"),
@@ -262,7 +262,7 @@ fn criteria_are_known_and_can_be_met() {
     ]);
 }
 
-/// The values of a key with each of their numbers, if it has any, replaced.
+/// Returns the values of a key with each of its numbers replaced in turn.
 fn with_number(key: &str, number: &str) -> Vec<String> {
     let line = line(line_of(PAIR, key).unwrap());
     let value = line.split_once(" = ").unwrap().1.split('#').next().unwrap().trim();
@@ -282,7 +282,7 @@ fn with_number(key: &str, number: &str) -> Vec<String> {
 }
 
 #[test]
-fn no_number_anywhere_is_infinite_undefined_or_absurd() {
+fn infinite_undefined_and_absurd_numbers_are_refused_everywhere() {
     for key in keys() {
         for number in ["nan", "inf", "-inf"] {
             for value in with_number(&key, number) {
@@ -303,7 +303,7 @@ fn no_number_anywhere_is_infinite_undefined_or_absurd() {
 }
 
 #[test]
-fn a_number_that_no_machine_holds_is_refused_at_its_line() {
+fn a_number_that_does_not_fit_is_refused_at_its_line() {
     for (key, number) in [
         ("tick_hz", "1e400"),
         ("tick_hz", "-1e999999999999"),

@@ -54,9 +54,10 @@ use crate::sample::FleetTruth;
 const WINDOW_TICKS: std::ops::RangeInclusive<u64> = 2..=64;
 /// Upper bound on the fleet samples that wait for one reader, bytes, unless the window's minimum needs more.
 const WAITING_BYTES: usize = 1 << 20;
-/// Samples of one signal, of all bodies together, that may wait for one reader in lockstep. A larger backlog leaves a core's caches.
+/// Upper bound on the samples of one signal, over all bodies, that wait for one reader in lockstep. A larger backlog does
+/// not fit into the caches of a core.
 const WAITING_SAMPLES: u64 = 512;
-/// The same bound for the scorer of a real-time run, bytes: the scorer reads rarely.
+/// Upper bound on the fleet samples that wait for the scorer in real time, bytes: the scorer reads rarely.
 const SCORED_BYTES: usize = 1 << 22;
 
 /// Returns the length of the longest fleet sample, bytes; `None` without a fleet.
