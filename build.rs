@@ -4,11 +4,11 @@
 use std::path::Path;
 use std::process::Command;
 
-/// What the program is made of: a change elsewhere does not make it another one.
+/// Sources of the program: only a change of these changes its revision.
 const SOURCES: [&str; 7] = ["build.rs", "Cargo.toml", "Cargo.lock", "bin", "config", "crates", "src"];
 
 fn main() {
-    // A package may lie in somebody else's repository.
+    // A package may lie in another repository.
     let revision = packaged().or_else(|| git(&["describe", "--always", "--dirty", "--abbrev=12"]));
     let revision = revision.unwrap_or("unknown".to_owned());
     let target = std::env::var("TARGET").unwrap_or("unknown".to_owned());
@@ -16,7 +16,7 @@ fn main() {
         println!("cargo::rustc-env=COROTATE_{name}={value}");
     }
     SOURCES.iter().for_each(|path| println!("cargo::rerun-if-changed={path}"));
-    // Commits and checkouts. Not the index, which every look at the state of the tree may write anew; and only what is there,
+    // Commits and checkouts. Not the index, which `git status` may rewrite; and only what is there,
     // or all would be built again every time.
     let logs = ["HEAD", "logs/HEAD"].iter().filter_map(|name| git(&["rev-parse", "--git-path", name]));
     logs.filter(|path| Path::new(path).exists()).for_each(|path| println!("cargo::rerun-if-changed={path}"));

@@ -2,7 +2,7 @@
 
 use crate::run::{failed, scenario};
 use corotate::bus::Port;
-use corotate::runtime::{RoleFunction, TickSamples, RoleId, ports};
+use corotate::runtime::{RoleFunction, RoleId, TickSamples, ports};
 use corotate::sample::{FieldKind, Stamp};
 use corotate::scenario::Scenario;
 use corotate::seat::{RoleAddress, run_function};
