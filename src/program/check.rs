@@ -110,27 +110,60 @@ fn json(path: &Path, scenario: &Scenario) -> String {
     format!("{value}\n")
 }
 
+/// Writes the loop's convergence first, then what weakens it, then the theorem behind it and the limits of the guards.
 fn tell_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
-    scenario.warnings.iter().try_for_each(|warning| writeln!(text, "warning: {warning}"))?;
-    scenario.notes().iter().try_for_each(|note| writeln!(text, "note: {note}"))?;
-    for limit in scenario.rig.limits() {
-        writeln!(text, "limit: {}: {}", limit.name, digits(limit.value))?;
-    }
     let claims = claims(scenario);
     if claims.is_empty() {
-        writeln!(text, "no body is driven, so there is no loop to claim anything of")?;
+        writeln!(text, "no body is driven, so no convergence rate is claimed")?;
     }
     let late = match scenario.actuation_delay_ticks {
         1 => "one tick".to_owned(),
         ticks => format!("{ticks} ticks"),
     };
-    claims.iter().try_for_each(|claim| tell_claim(claim, &late, text))
+    claims.iter().try_for_each(|claim| tell_loop(claim, &late, text))?;
+    scenario.warnings.iter().try_for_each(|warning| writeln!(text, "warning: {warning}"))?;
+    scenario.notes().iter().try_for_each(|note| writeln!(text, "note: {note}"))?;
+    claims.iter().try_for_each(|claim| tell_theorem(claim, text))?;
+    let limits = scenario.rig.limits();
+    if !limits.is_empty() {
+        writeln!(text, "limits of the guards")?;
+    }
+    limits.iter().try_for_each(|limit| writeln!(text, "  {}: {}", limit.name, digits(limit.value)))
 }
 
-fn tell_claim(claim: &Claim, late: &str, text: &mut String) -> std::fmt::Result {
+/// Writes the convergence of the loop that runs.
+fn tell_loop(claim: &Claim, late: &str, text: &mut String) -> std::fmt::Result {
+    match (claim.loop_rate_text(), claim.over_s, &claim.reason) {
+        (Some(rate), Some(over_s), _) => {
+            writeln!(text, "{}: a small error falls as exp(-{rate} t)", claim.body)?;
+            writeln!(text, "  in the sampled loop, {late} late; computed over the first {} s", digits(over_s))?;
+        }
+        (_, _, reason) => {
+            writeln!(text, "{}: no rate is claimed: {}", claim.body, reason.as_deref().unwrap_or_default())?;
+        }
+    }
+    for reach in &claim.reaches {
+        let (metric, limit, from) = (&reach.metric, digits(reach.limit), digits(reach.from));
+        match reach.after_s {
+            Some(after_s) => writeln!(text, "  {metric}: from {from} to {limit} in {} s", digits(after_s))?,
+            None => writeln!(text, "  {metric}: from {from}, never to {limit}, which is below the floor")?,
+        }
+    }
+    for floor in &claim.floors {
+        writeln!(text, "  {}: floor {}", floor.name, digits(floor.value))?;
+    }
+    // The reason why no rate is claimed is a warning too, and is written above.
+    let mut others = claim.warnings.iter().filter(|warning| claim.reason.as_ref() != Some(*warning));
+    others.try_for_each(|warning| writeln!(text, "  warning: {warning}"))
+}
+
+/// Writes what is proven of the law in continuous time.
+fn tell_theorem(claim: &Claim, text: &mut String) -> std::fmt::Result {
     writeln!(text, "{}, the law in continuous time", claim.body)?;
-    for bound in &claim.bounds {
-        writeln!(text, "  {}: {}", bound.name, digits(bound.value))?;
+    match claim.continuous_rate_per_s {
+        Some(rate) => writeln!(text, "  the error falls at least as exp(-{} t)", digits(rate))?,
+        None if claim.conditions.is_empty() => writeln!(text, "  the rig has no theorem for it")?,
+        None => writeln!(text, "  no constant rate: the observer's gain varies")?,
     }
     for condition in &claim.conditions {
         let verdict = if condition.holds { "holds" } else { "does not hold" };
@@ -138,30 +171,5 @@ fn tell_claim(claim: &Claim, late: &str, text: &mut String) -> std::fmt::Result 
         let margin = digits(condition.value - condition.required);
         writeln!(text, "  {}: {value} > {required} {verdict}, margin {margin}", condition.name)?;
     }
-    match claim.continuous_rate_per_s {
-        Some(rate) => writeln!(text, "  its error falls at least as exp(-{} t)", digits(rate))?,
-        None if claim.conditions.is_empty() => writeln!(text, "  this rig proves nothing of it")?,
-        None => writeln!(text, "  no constant rate: the observer's gain varies")?,
-    }
-    writeln!(text, "{}, the loop that runs: sampled, held, {late} late", claim.body)?;
-    match (claim.loop_rate_text(), claim.over_s, &claim.reason) {
-        (Some(rate), Some(over_s), _) => {
-            let over = digits(over_s);
-            writeln!(text, "  once it is small, the error falls as exp(-{rate} t); computed over the first {over} s")?;
-        }
-        (_, _, reason) => writeln!(text, "  no rate is claimed: {}", reason.as_deref().unwrap_or_default())?,
-    }
-    for floor in &claim.floors {
-        writeln!(text, "  floor to expect: {} {}", floor.name, digits(floor.value))?;
-    }
-    for reach in &claim.reaches {
-        let (metric, limit, from) = (&reach.metric, digits(reach.limit), digits(reach.from));
-        match reach.after_s {
-            Some(after_s) => writeln!(text, "  {metric} from {from} to {limit}: {} s at that rate", digits(after_s))?,
-            None => writeln!(text, "  {metric} from {from} to {limit}: never, it is below the floor")?,
-        }
-    }
-    // The reason why no rate is claimed is a warning too, and is told above.
-    let mut others = claim.warnings.iter().filter(|warning| claim.reason.as_ref() != Some(*warning));
-    others.try_for_each(|warning| writeln!(text, "  warning: {warning}"))
+    claim.bounds.iter().try_for_each(|bound| writeln!(text, "  {}: {}", bound.name, digits(bound.value)))
 }
