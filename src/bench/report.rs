@@ -92,14 +92,14 @@ pub fn table(results: &Results) -> String {
     for reason in &results.not_judged {
         let _ = writeln!(text, "no target is judged: {reason}");
     }
+    if !results.targets.is_empty() {
+        let _ = writeln!(text, "\n{}", targets(&results.targets));
+    }
     for Row { name, title, .. } in &results.rows {
         let figures: Vec<_> = results.figures.iter().filter(|figure| figure.row == *name).collect();
         if !figures.is_empty() {
             let _ = writeln!(text, "\n{name}: {title}\n{}", rows(&figures));
         }
-    }
-    if !results.targets.is_empty() {
-        let _ = writeln!(text, "\n{}", targets(&results.targets));
     }
     for remark in &results.remarks {
         let _ = writeln!(text, "note: {remark}");
