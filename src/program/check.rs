@@ -3,7 +3,7 @@
 use super::campaign;
 use super::output::{Ended, Exit, Failure, fail, say};
 use super::scenario::{Change, load};
-use crate::analysis::{Claim, apart, digits};
+use crate::analysis::{Claim, Reach, apart, digits};
 use crate::campaign::Campaign;
 use crate::launch::check_cores;
 use crate::scenario::Scenario;
@@ -142,15 +142,13 @@ fn tell_loop(claim: &Claim, late: &str, text: &mut String) -> std::fmt::Result {
             writeln!(text, "{}: no rate is claimed: {}", claim.body, reason.as_deref().unwrap_or_default())?;
         }
     }
-    for reach in &claim.reaches {
-        let (metric, limit, from) = (&reach.metric, digits(reach.limit), digits(reach.from));
-        match reach.after_s {
-            Some(after_s) => writeln!(text, "  {metric}: from {from} to {limit} in {} s", digits(after_s))?,
-            None => writeln!(text, "  {metric}: from {from}, never to {limit}, which is below the floor")?,
-        }
-    }
     for floor in &claim.floors {
-        writeln!(text, "  {}: floor {}", floor.name, digits(floor.value))?;
+        let reach = claim.reaches.iter().find(|reach| reach.metric == floor.name);
+        let fall = reach.map_or(String::new(), |Reach { from, limit, after_s, .. }| {
+            let time = after_s.map_or("never".to_owned(), |after_s| format!("in {} s", digits(after_s)));
+            format!("from {} to {} {time}; ", digits(*from), digits(*limit))
+        });
+        writeln!(text, "  {}: {fall}floor {}", floor.name, digits(floor.value))?;
     }
     // The reason why no rate is claimed is a warning too, and is written above.
     let mut others = claim.warnings.iter().filter(|warning| claim.reason.as_ref() != Some(*warning));
