@@ -21,13 +21,13 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// What the device is called: kind and version.
+/// The name of the device: kind and version.
 pub const NAME: &str = "serial_device 1";
 const INERTIA_KG_M2: [f64; 3] = [1.0, 2.0, 2.5];
 const INITIAL_RATE_RAD_S: [f64; 3] = [-0.3, 0.5, 0.2];
 /// All three gyros are there.
 const ALL_VALID: u64 = 0b111;
-/// How long the device sleeps when nothing has come. Firmware would wait for the next byte or timer instead.
+/// The sleep when no byte has arrived. Firmware would wait for the next byte or timer instead.
 const NAP: Duration = Duration::from_micros(50);
 
 /// A rigid body with three gyros and three torquers.
