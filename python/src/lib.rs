@@ -11,7 +11,7 @@ mod sweep;
 
 use pyo3::prelude::*;
 
-/// What corotate's package is made of.
+/// The extension module of the package.
 #[pymodule]
 fn _corotate(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(run::main, module)?)?;

@@ -35,7 +35,7 @@ fn samples(
     Ok((0..time.len()).map(sample).collect())
 }
 
-/// What a log says of a body, as JSON.
+/// Identifies a body from a log; returns JSON.
 #[pyfunction]
 pub fn identify(
     py: Python<'_>,
@@ -82,7 +82,8 @@ pub fn identify(
     Ok(value.to_string())
 }
 
-/// The rate about a hidden axis (1 to 3), rad/s, not a number as long as nothing has told of it; and whether each step told of it.
+/// Estimates the rate about a hidden axis (1 to 3), rad/s, NaN before the first information; and returns whether each step was
+/// informative.
 #[pyfunction]
 #[allow(clippy::too_many_arguments, reason = "one call from one place")]
 pub fn reconstruct<'py>(
@@ -165,8 +166,8 @@ pub fn thrust(
     let thrust = match (target.as_slice(), <[f64; 4]>::try_from(target.as_slice())) {
         ([radius], _) => law.to_circle(*radius, &body, &applied),
         (_, Ok(leader)) => law.to_leader(&state(leader), &body, &applied),
-        (other, _) => {
-            let count = other.len();
+        (target, _) => {
+            let count = target.len();
             return Err(PyValueError::new_err(format!(
                 "a target of {count} numbers: give a radius, or (r, theta, vr, vtheta)"
             )));

@@ -41,12 +41,12 @@ impl Recording {
     /// Every signal: body, name, and its fields with kind and count, the stamp's first.
     fn signals(&self) -> Vec<Signal> {
         let kind = |kind| if kind == FieldKind::F64 { "f8" } else { "u8" }.to_owned();
-        let of = |info: &corotate::record::SignalInfo| {
+        let signal = |info: &corotate::record::SignalInfo| {
             let columns =
                 info.layout.columns.iter().map(|column| (column.name.clone(), kind(column.kind), column.count));
             (info.body.clone(), info.signal.clone(), columns.collect())
         };
-        self.recorded.signals().iter().map(of).collect()
+        self.recorded.signals().iter().map(signal).collect()
     }
 
     /// Scenario, clock, period in ns, and the scenario as TOML.
@@ -68,11 +68,11 @@ impl Recording {
                 names.iter().any(|(body, name)| (body, name) == (&info.body, &info.signal))
             };
             let tracks = self.recorded.tracks(wanted).map_err(failed)?;
-            let of = |(body, name): &(String, String)| {
+            let values = |(body, name): &(String, String)| {
                 let track = tracks.iter().find(|track| (&track.info.body, &track.info.signal) == (body, name));
                 track.map(words).ok_or_else(|| failed(format!("the recording has no signal {body}/{name}")))
             };
-            names.iter().map(of).collect::<PyResult<Vec<_>>>()
+            names.iter().map(values).collect::<PyResult<Vec<_>>>()
         })?;
         Ok(read.into_iter().map(|(words, each)| (words.into_pyarray(py), each)).collect())
     }

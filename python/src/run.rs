@@ -106,7 +106,7 @@ pub fn run(
     let mut raised: Option<PyErr> = None;
     let ended: Result<String, PyErr> = py.detach(|| {
         let mut progress = |progress: &Progress<'_>| {
-            let told = Python::attach(|py| {
+            let called = Python::attach(|py| {
                 py.check_signals()?;
                 let Some(tell) = &tell else { return Ok(()) };
                 match progress {
@@ -116,7 +116,7 @@ pub fn run(
                 }
                 .map(drop)
             });
-            if let Err(error) = told {
+            if let Err(error) = called {
                 signal.store(SIGINT, Ordering::Relaxed);
                 raised.get_or_insert(error);
             }
@@ -135,11 +135,11 @@ pub fn run(
         let _ = make_latest(&directory);
         serde_json::to_string(&summary).map_err(failed)
     });
-    // The exception of whoever was told comes before what followed from it.
+    // The exception of the progress function comes before the failures that follow from it.
     raised.map_or(ended, Err).map(|summary| (summary, directory))
 }
 
-/// What may be claimed of a scenario's loop, as JSON: one entry per driven body.
+/// Returns the convergence claims of a scenario's loop as JSON: one entry per driven body.
 #[pyfunction]
 pub fn certificate(py: Python<'_>, given: &str, kind: &str, overrides: Vec<String>) -> PyResult<String> {
     let scenario = scenario(given, kind, &overrides)?;

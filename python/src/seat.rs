@@ -17,28 +17,28 @@ use std::time::Duration;
 
 /// Between two looks for Ctrl-C.
 const LOOK: Duration = Duration::from_millis(50);
-/// What a function is told that nobody asks any more.
-const LEFT: &str = "nobody computes this role any more";
+/// The error of a function whose role has ended.
+const LEFT: &str = "this role is not computed any more";
 
 /// A signal: body and signal, and each field with its kind, count and offset in bytes after the stamp.
 pub type LayoutOf = (String, String, Vec<(String, String, usize, usize)>);
 
-/// What a role reads, and what it writes.
+/// The layouts that a role reads, and those that it writes.
 pub type Seat = (Vec<LayoutOf>, Vec<LayoutOf>);
 
 /// The layouts of what a role reads and writes.
 fn layouts(ports: &[Port]) -> Vec<LayoutOf> {
     let kind = |kind: FieldKind| if kind == FieldKind::F64 { "f8" } else { "u8" }.to_owned();
-    let of = |port: &Port| {
+    let layout = |port: &Port| {
         let field = |field: &corotate::sample::Field| {
             (field.name.to_owned(), kind(field.kind), field.count, field.offset - size_of::<Stamp>())
         };
         (port.topic.body.clone(), port.topic.signal.name().to_owned(), port.fields.iter().map(field).collect())
     };
-    ports.iter().map(of).collect()
+    ports.iter().map(layout).collect()
 }
 
-/// What a role of a scenario reads, and what it writes.
+/// Returns the layouts that a role of a scenario reads and writes.
 pub fn seat_of(scenario: &Scenario, role: &str) -> PyResult<Seat> {
     let known = scenario.rig.roles().join(", ");
     let id = RoleId::named(scenario, role)
@@ -154,7 +154,7 @@ impl RoleFunction for Handed {
     }
 }
 
-/// Where ticks come from, and where their outputs go.
+/// The source of ticks and the destination of their outputs.
 type Line = (Receiver<Asked>, SyncSender<Vec<Vec<u8>>>);
 
 /// A seat that is asked for tick after tick. A thread serves it meanwhile.
@@ -186,7 +186,7 @@ impl Ticks {
     fn next(&mut self, py: Python<'_>, outputs: Option<Vec<Vec<u8>>>) -> PyResult<Option<Asked>> {
         let mut line = self.line.lock().map_err(failed)?;
         let Some((ticks, give)) = &mut *line else { return Ok(None) };
-        // A seat that has ended takes nothing more; it is told below.
+        // A seat that has ended takes nothing more; that is reported below.
         let _ = outputs.map(|outputs| give.send(outputs));
         loop {
             let ticks = &mut *ticks;

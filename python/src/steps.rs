@@ -33,7 +33,7 @@ pub struct Steps {
     observation: Vec<f64>,
     over: bool,
     started: SystemTime,
-    /// Where the results go, if they are kept.
+    /// The directory of the results, if they are kept.
     results: Option<(PathBuf, Claim)>,
 }
 
@@ -97,22 +97,22 @@ impl Steps {
         seat_of(&self.scenario, "controller")
     }
 
-    /// What is observed at the tick at hand.
+    /// The observation of the current tick.
     fn observation<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         PyArray1::from_slice(py, &self.observation)
     }
 
-    /// Whether there is no tick any more.
+    /// Returns true after the last tick.
     fn over(&self) -> bool {
         self.over
     }
 
-    /// The tick at hand.
+    /// The current tick.
     fn tick(&mut self) -> PyResult<u64> {
         self.steps().map(|steps| steps.tick())
     }
 
-    /// Acts at the tick at hand, and observes the next: what is seen, the metric of the tick, whether it was the last, and, unless
+    /// Acts at the current tick and observes the next: the observation, the metric of the tick, whether it was the last, and, unless
     /// it was, what the bodies did with their commands.
     fn step<'py>(&mut self, py: Python<'py>, action: PyReadonlyArray1<'py, f64>) -> PyResult<Stepped<'py>> {
         let action = action.as_slice()?;
@@ -122,9 +122,9 @@ impl Steps {
         }
         let mut rest = action;
         for (command, count) in self.commands.iter_mut().zip(&self.actions) {
-            let (own, others) = rest.split_at(*count);
+            let (own, following) = rest.split_at(*count);
             command.iter_mut().zip(own).for_each(|(word, value)| *word = value.to_bits());
-            rest = others;
+            rest = following;
         }
         self.act_and_observe()?;
         let metric = self.steps()?.metric();

@@ -1,4 +1,4 @@
-//! Campaigns: run here, or piece by piece by whoever has room.
+//! Campaigns: run here, or piece by piece by other workers.
 
 use crate::run::{failed, refused, shipped};
 use corotate::campaign::{Campaign, Collection, SHIPPED, Sweep, Swept};
@@ -42,7 +42,7 @@ fn load(given: &str, kind: &str, overrides: &[String]) -> PyResult<Campaign> {
     .map_err(refused)
 }
 
-/// A campaign: what its cases are, and what comes of each.
+/// A campaign with its cases.
 #[pyclass(frozen, name = "Campaign")]
 pub struct Cases {
     campaign: Campaign,
@@ -60,12 +60,12 @@ impl Cases {
         self.campaign.to_toml()
     }
 
-    /// What its cases follow from, as a hash.
+    /// The hash of everything that determines the cases.
     fn identity(&self) -> String {
         self.campaign.identity()
     }
 
-    /// Where the results go.
+    /// Returns the directory of the results.
     fn directory(&self, out: Option<PathBuf>) -> PyResult<PathBuf> {
         match out {
             Some(out) => Ok(out),
@@ -73,12 +73,12 @@ impl Cases {
         }
     }
 
-    /// How many pieces of work it has.
+    /// The number of pieces of work.
     fn pieces(&self) -> u64 {
         self.campaign.pieces()
     }
 
-    /// What comes of these pieces of work, each as JSON.
+    /// Runs these pieces of work; returns the result of each as JSON.
     fn work(&self, py: Python<'_>, pieces: Vec<u64>) -> PyResult<Vec<String>> {
         let never = AtomicUsize::new(0);
         let done = |piece| self.campaign.work(piece, ClockKind::InProcess, &never);
@@ -95,11 +95,11 @@ impl Cases {
         let mut raised: Option<PyErr> = None;
         let swept: PyResult<Swept> = py.detach(|| {
             let mut progress = |done: u64, all: u64| {
-                let told = Python::attach(|py| {
+                let called = Python::attach(|py| {
                     py.check_signals()?;
                     tell.as_ref().map_or(Ok(()), |tell| tell.call1(py, (done, all)).map(drop))
                 });
-                if let Err(error) = told {
+                if let Err(error) = called {
                     signal.store(SIGINT, Ordering::Relaxed);
                     raised.get_or_insert(error);
                 }
@@ -136,7 +136,7 @@ impl Results {
         Ok(self.collection()?.left())
     }
 
-    /// Takes what came of a piece of work.
+    /// Adds the result of a piece of work.
     fn add(&mut self, entry: &str) -> PyResult<()> {
         let entry = serde_json::from_str(entry).map_err(failed)?;
         self.collection()?.add(&entry).map_err(failed)

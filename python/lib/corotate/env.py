@@ -1,4 +1,4 @@
-"""A loop as an environment of gymnasium: whoever steps it is the controller."""
+"""A loop as an environment of gymnasium: the caller is the controller."""
 
 import json
 
@@ -17,8 +17,8 @@ class Env(gymnasium.Env):
     """A scenario in one thread. The bits are those of a run with the same commands and the same seed.
 
     An observation has every number of the estimate, then of each driven body's measurement, in SI units (`observation_names`), bounded
-    by what the guards believe; a number stays where its sample is missing. An action is the first field of each command
-    (`action_names`), bounded by `action_bound` or else by what the command guard believes; with `normalize_actions` it is from -1 to 1
+    by what the guards accept; a number stays where its sample is missing. An action is the first field of each command
+    (`action_names`), bounded by `action_bound` or else by what the command guard accepts; with `normalize_actions` it is from -1 to 1
     of that. The reward is minus the scenario's first metric.
 
     An episode is truncated at the scenario's last tick. It is terminated where a body's motion has met the end of its model:

@@ -47,15 +47,15 @@ def identify(t, w, *, segments=None, damping=True):
     segments : (n,) labels
         Where a label changes, the motion was not free in between.
     damping : bool
-        Whether the torque of the air is part of the fit.
+        True to fit the torque of the air too.
 
     >>> t = np.arange(0, 20, 0.01)
     >>> w = euler([1.0, 2.0, 2.5], [0.6, -0.4, 0.8], t)
     >>> corotate.identify(t, w, damping=False).moments.round(3)
     array([0.4, 0.8, 1. ])
     """
-    told = json.loads(_corotate.identify(*_log(t, w, segments), damping))
-    arrays = {key: np.array(value) if isinstance(value, list) and key != "findings" else value for key, value in told.items()}
+    found = json.loads(_corotate.identify(*_log(t, w, segments), damping))
+    arrays = {key: np.array(value) if isinstance(value, list) and key != "findings" else value for key, value in found.items()}
     return Identified(**arrays)
 
 
@@ -67,15 +67,15 @@ class HiddenRate:
     inertia : (3,) any unit
     hidden : 1, 2 or 3
     decay : 1/s
-        How fast the error falls (first order).
+        Decay rate of the error (first order).
     bandwidth : rad/s
         Instead of decay, a filter of second order.
     damping : 1/s
-        That of the air, 0 without.
+        Damping by the air; 0 without.
     guess : rad/s
-        The first estimate of every segment; without one it is what the first step tells.
+        The first estimate of every segment; without one, that of the first step.
     floor : rad/s
-        Below this the measured rates carry no information.
+        Smallest measured rate that carries information.
 
     >>> t = np.arange(0, 20, 0.01)
     >>> w = euler([1.0, 2.0, 2.5], [0.6, -0.4, 0.8], t)
@@ -92,7 +92,7 @@ class HiddenRate:
         self.hidden = hidden
 
     def filter(self, t, w, *, segments=None):
-        """The hidden rate along a log, (n,) rad/s, nan as long as nothing has told of it; and whether each step told of it, (n,) bool.
+        """Estimates the hidden rate along a log: (n,) rad/s, nan before the first information; and (n,) bool, true where a step was informative.
 
         `t` is (n,) s, `w` (n, 3) rad/s; the hidden column is not read and may hold anything.
         """

@@ -6,7 +6,7 @@ import pytest
 @pytest.fixture
 def corotate_run(request, tmp_path):
     """`corotate.run`, into the test's own directory and recorded: its verdict and hash go to JUnit, and where the test fails the
-    path of its report is told.
+    path of its report is printed.
     """
     import corotate
     runs = []

@@ -187,8 +187,8 @@ def _launched(arguments, roles, start, timeout):
         ended = _with_run(errors[first], made, first)
     elif lost:
         incident = lost[0]
-        said = f"; it said: {incident['last_words']}" if incident["last_words"] else ""
-        ended = _with_run(_corotate.CorotateError(f"the {first} failed at tick {incident['tick']}: {incident['cause']}{said}"), made)
+        last_words = f"; its last words: {incident['last_words']}" if incident["last_words"] else ""
+        ended = _with_run(_corotate.CorotateError(f"the {first} failed at tick {incident['tick']}: {incident['cause']}{last_words}"), made)
     if ended is not None:
         raise ended
     return made

@@ -22,7 +22,7 @@ def toml(value):
         values = value.tolist() if hasattr(value, "tolist") else value
         return "[" + ", ".join(map(toml, values)) + "]" if isinstance(values, (list, tuple)) else toml(values)
     if isinstance(value, float):
-        # Infinities and what is no number are told by TOML too, by other words than JSON's.
+        # TOML has infinities and NaN too, spelled as by repr and not as in JSON.
         return repr(value)
     if isinstance(value, os.PathLike):
         value = os.fspath(value)

@@ -48,7 +48,7 @@ def _campaign(text, identity):
 
 
 def _work(text, identity, build, pieces):
-    """What comes of some pieces of a campaign's work: the task of a worker."""
+    """Runs some pieces of a campaign's work: the task of a worker."""
     if build != _corotate.build:
         raise RuntimeError(f"this worker has corotate {_corotate.build}, and the campaign was begun with {build}; install the same")
     return _campaign(text, identity).work(pieces)
