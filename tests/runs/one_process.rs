@@ -230,7 +230,7 @@ fn what_cannot_share_a_process_is_refused_with_its_reason() {
     );
     refused(&["run", &pair, "--set=launch.processes=[['leader']]"], &["launch.processes[0]", "name two roles or more"]);
     let twice = "--set=launch.processes=[['leader','observer'],['observer','controller']]";
-    refused(&["run", &pair, twice], &["launch.processes[1][0]", "cannot be in two places", "name it once"]);
+    refused(&["run", &pair, twice], &["launch.processes[1][0]", "is listed twice", "list it once"]);
     refused(&["run", &pair, "--set=launch.processes=['leader']"], &["launch.processes[0]", "list"]);
     refused(&["run", &pair, "--set=launch.process=[]"], &["did you mean `processes`?"]);
 }

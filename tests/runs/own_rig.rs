@@ -278,7 +278,7 @@ fn a_law_that_panics_is_told_by_its_message_and_place() {
     for (kind, message, starts) in [
         ("lines", "the rate is NaN\n  at tick 500", 2),
         ("long", "the rate is NaNé", 2),
-        ("any", "a value that is no text", 2),
+        ("any", "a value that is not text", 2),
         ("nested", "the rate is NaN", 2),
         ("index", "index out of bounds: the len is 0 but the index is 500", 2),
     ] {

@@ -1,13 +1,13 @@
-//! Errors with their codes, as a command prints them. Must not print.
+//! Errors with their codes, in the form in which a command prints them. This file does not print.
 
 use crate::config::ConfigError;
 use std::fmt;
 
-/// An error as it is printed: the text of each mistake, and its code (docs/commands.md).
+/// The mistakes of a failed command: the text and the code (docs/commands.md) of each.
 pub struct Failure(pub Vec<(String, &'static str)>);
 
 impl Failure {
-    /// One mistake with its code.
+    /// Creates a failure of one mistake.
     pub fn new(code: &'static str, text: impl ToString) -> Self {
         Self(vec![(text.to_string(), code)])
     }
@@ -34,12 +34,12 @@ impl From<ConfigError> for Failure {
     }
 }
 
-/// The code ends the first line of a mistake; the line of a file that it quotes comes after.
+/// Writes the code at the end of each mistake's first line; a quoted line of a file follows it.
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (index, (text, code)) in self.0.iter().enumerate() {
-            let (first, others) = text.split_at(text.find('\n').unwrap_or(text.len()));
-            write!(f, "{}{first} [{code}]{others}", if index > 0 { "\n" } else { "" })?;
+            let (first, rest) = text.split_at(text.find('\n').unwrap_or(text.len()));
+            write!(f, "{}{first} [{code}]{rest}", if index > 0 { "\n" } else { "" })?;
         }
         Ok(())
     }

@@ -1,6 +1,6 @@
-//! Files beside other users: what is this user's alone, and what is written where others can write too.
+//! Files on a machine with other users: private directories, and safe writing where other users can write too.
 //!
-//! Must not know what the files hold.
+//! This file does not know what the files contain.
 
 use crate::system::random_bits;
 use rustix::fs::{AtFlags, CWD, FileType, FlockOperation, Mode, OFlags, PROC_SUPER_MAGIC};
@@ -17,24 +17,24 @@ use std::os::unix::ffi::OsStringExt;
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Component, Path, PathBuf};
 
-/// Rights of others than the owner.
+/// The permission bits of other users.
 const OTHERS: u32 = 0o077;
-/// Rights of others than the owner to write.
+/// The write permission bits of other users.
 const OTHERS_WRITE: u32 = 0o022;
-/// A directory in which nobody can take away what is another's.
+/// The sticky bit: only the owner of a file can remove it from the directory.
 const STICKY: u32 = 0o1000;
-/// As many links are followed on a path as the kernel follows.
+/// The largest number of links followed on a path, as in the kernel.
 const LINKS_MAX: u32 = 40;
-/// How often a file is looked for again that somebody changed meanwhile.
+/// The number of attempts to open a file that changes meanwhile.
 const ATTEMPTS: u32 = 100;
-/// Who stands for the users that a user namespace does not have.
+/// The user id that stands for all users outside the user namespace.
 const OVERFLOW_USER: u32 = 65_534;
 
-/// Why a directory is not this user's alone.
+/// The reason why a directory is not private to this user.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum PrivacyError {
-    /// It is somebody else's.
+    /// It belongs to another user.
     #[error("{} belongs to {owner}, not to {}; unset XDG_RUNTIME_DIR or set it to a directory of your own", path.display(), user_name(user()))]
     #[strum(serialize = "foreign-directory")]
     Foreign {
@@ -43,7 +43,7 @@ pub enum PrivacyError {
         /// Its owner.
         owner: String,
     },
-    /// Others can read it or write to it.
+    /// Other users have permissions on it.
     #[error("{} is open to other users (mode {:03o}); take it from them with `chmod 700`, or remove it", path.display(), mode & 0o7777)]
     #[strum(serialize = "open-directory")]
     Open {
@@ -52,24 +52,24 @@ pub enum PrivacyError {
         /// Its mode.
         mode: u32,
     },
-    /// Others can put something else in its place.
+    /// Other users can replace it.
     #[error("{} lies in {}, where {who} can put another in its place; set XDG_RUNTIME_DIR to a directory of your own", path.display(), ancestor.display())]
     #[strum(serialize = "exposed-directory")]
     Exposed {
         /// The directory.
         path: PathBuf,
-        /// A directory that it lies in.
+        /// The directory above it that is not safe.
         ancestor: PathBuf,
-        /// Who can write to that.
+        /// The user who can write to that.
         who: String,
     },
-    /// It is none.
+    /// It is not a directory.
     #[error("{} is not a directory; remove it, or set XDG_RUNTIME_DIR to a directory of your own", path.display())]
     NotADirectory {
-        /// What is in its place.
+        /// The path.
         path: PathBuf,
     },
-    /// It cannot be looked at.
+    /// It cannot be examined.
     #[error("cannot look at {}: {source}; set XDG_RUNTIME_DIR to a directory of your own", path.display())]
     #[strum(serialize = "cannot-examine")]
     System {
@@ -80,12 +80,12 @@ pub enum PrivacyError {
     },
 }
 
-/// This process's user.
+/// Returns the user of this process.
 pub(crate) fn user() -> u32 {
     rustix::process::geteuid().as_raw()
 }
 
-/// A user's name and number, as far as they are known here.
+/// Returns a user's name and number, or the number alone if the name is unknown.
 pub(crate) fn user_name(user: u32) -> String {
     let known = fs::read_to_string("/etc/passwd").unwrap_or_default();
     let named = known.lines().find_map(|line| {
@@ -96,13 +96,13 @@ pub(crate) fn user_name(user: u32) -> String {
     named.unwrap_or_else(|| format!("uid {user}"))
 }
 
-/// Whether nobody need be protected from a user: this one, or root. A user namespace may not have root; who is not in it
-/// counts as root there.
+/// Returns true if files need no protection from this user: the process's own user, or root. In a user namespace without root,
+/// the overflow user stands for root.
 fn is_trusted(owner: u32) -> bool {
     owner == 0 || owner == user() || owner == OVERFLOW_USER && !has_overflow_user()
 }
 
-/// Whether this user namespace has a user with the number that stands for all that it does not have.
+/// Returns true if this user namespace maps the overflow user id to a real user.
 fn has_overflow_user() -> bool {
     let map = fs::read_to_string("/proc/self/uid_map").unwrap_or_default();
     map.lines().any(|line| {
@@ -112,8 +112,8 @@ fn has_overflow_user() -> bool {
     })
 }
 
-/// The path of a directory without links, after checking that it is this user's, closed to others, and that nobody but root
-/// can put another in its place: then it stays what it is, and so does everything in it.
+/// Returns the path without links, after checking that the directory belongs to this user, is closed to others, and cannot be
+/// replaced by anyone but root. The directory and its content then stay what they are.
 ///
 /// # Errors
 /// [`PrivacyError`].
@@ -140,15 +140,15 @@ pub fn require_private(path: &Path) -> Result<PathBuf, PrivacyError> {
             return Err(PrivacyError::Exposed { path: whole.clone(), ancestor: ancestor.to_owned(), who });
         }
     }
-    // What was looked at by the given path is what the path without links leads to.
+    // The directory examined by the given path must be the one at the path without links.
     let same = |a: &Metadata, b: &Metadata| (a.dev(), a.ino()) == (b.dev(), b.ino());
     if same(&about, &look(&whole)?) { Ok(whole) } else { Err(PrivacyError::NotADirectory { path: path.to_owned() }) }
 }
 
-/// Checks that an open file is a plain one of this user's, and goes by one name.
+/// Checks that an open file is a regular file of this user with a single hard link.
 ///
 /// # Errors
-/// What else it is.
+/// The property that is wrong.
 pub fn require_own(file: &File) -> io::Result<()> {
     let about = file.metadata()?;
     if about.is_file() && about.uid() == user() && about.nlink() == 1 {
@@ -172,7 +172,7 @@ pub fn open_with(path: &Path, options: &mut OpenOptions, flags: OFlags) -> io::R
     let flags = OFlags::NONBLOCK | OFlags::NOCTTY | flags;
     let irregular = || io::Error::new(io::ErrorKind::InvalidInput, "it is not a regular file");
     match options.custom_flags(flags.bits() as i32).open(path) {
-        // A socket, or a FIFO that has no reader, cannot be opened so.
+        // Opening a socket, or a FIFO without reader, fails with this error.
         Err(error) if error.raw_os_error() == Some(libc::ENXIO) => Err(irregular()),
         file => file.and_then(|file| if file.metadata()?.is_file() { Ok(file) } else { Err(irregular()) }),
     }
@@ -208,7 +208,7 @@ pub fn lock(file: &File, path: &Path) -> io::Result<bool> {
     Ok(fs::symlink_metadata(path).is_ok_and(same))
 }
 
-/// Locks a file, or fails at once where another process has. A signal is no reason to fail.
+/// Locks a file, or fails at once if another process holds a lock. Retries after signals.
 fn lock_now(file: impl AsFd) -> Result<(), Errno> {
     let mut locked = Err(Errno::INTR);
     for _ in 0..ATTEMPTS {
@@ -220,15 +220,15 @@ fn lock_now(file: impl AsFd) -> Result<(), Errno> {
     locked
 }
 
-/// A directory that is open, so that what is done in it happens there, whatever becomes of its name.
+/// An open directory. Operations in it stay in this directory, even if its path is changed.
 #[derive(Debug)]
 pub struct Directory(OwnedFd);
 
 impl Directory {
-    /// The directory at a path on which no link of another user lies.
+    /// Opens a directory; no component of the path may be a link of another user.
     ///
     /// # Errors
-    /// Those of the system.
+    /// Errors of the system.
     pub fn open(path: &Path) -> io::Result<Self> {
         match locate(path)? {
             Place { directory, name: None, .. } => Ok(directory),
@@ -236,22 +236,22 @@ impl Directory {
         }
     }
 
-    /// A path to it, as long as it is open.
+    /// Returns a path to the directory, valid while it is open.
     pub fn path(&self) -> PathBuf {
         PathBuf::from(format!("/proc/self/fd/{}", self.0.as_raw_fd()))
     }
 }
 
-/// Where a path leads.
+/// The result of following a path.
 struct Place {
     directory: Directory,
-    /// In the directory, and no link; none if the path leads to the directory itself.
+    /// The last component, which is not a link to follow; `None` if the path is the directory itself.
     name: Option<OsString>,
-    /// Whether the name is one of /proc for a file that is open.
+    /// True if the name is an entry of /proc for an open file.
     is_open: bool,
 }
 
-/// Follows a path step by step. A link that another user has put there is not followed: it leads where he wants.
+/// Follows a path step by step. Refuses a link of another user, who controls where it leads.
 fn locate(path: &Path) -> io::Result<Place> {
     const STEP: OFlags = OFlags::PATH.union(OFlags::NOFOLLOW).union(OFlags::CLOEXEC);
     let open = |directory: &OwnedFd, name: &Path| openat(directory, name, STEP | OFlags::DIRECTORY, Mode::empty());
@@ -298,16 +298,16 @@ fn locate(path: &Path) -> io::Result<Place> {
     Ok(Place { directory: Directory(directory), name: None, is_open: false })
 }
 
-/// Opens a file to write it anew, as [`File::create`] does, but follows no link of another user, and writes to no file that
-/// has a second name: that may be anywhere. Refuses a file that another process has opened so.
+/// Opens a file for rewriting, as [`File::create`] does. It follows no link of another user, and replaces a file with several
+/// hard links, since another name may be anywhere. Refuses a file that another process is writing.
 ///
 /// # Errors
-/// Those of the system.
+/// Errors of the system.
 pub fn create(path: &Path) -> io::Result<Created> {
-    open_anew(path).map(Created)
+    open_for_rewriting(path).map(Created)
 }
 
-/// A file that is being written anew, and that no other process may open so until it is dropped.
+/// A file being rewritten. No other process can open it this way until it is dropped.
 #[derive(Debug)]
 pub struct Created(File);
 
@@ -337,12 +337,12 @@ impl io::Write for Created {
 
 impl Drop for Created {
     fn drop(&mut self) {
-        // Closing it is not enough: a process that another thread has just forked has it too until it executes its program.
+        // Closing is not enough: a process that another thread has just forked holds the file until it executes its program.
         let _ = self.0.unlock();
     }
 }
 
-fn open_anew(path: &Path) -> io::Result<File> {
+fn open_for_rewriting(path: &Path) -> io::Result<File> {
     const WRITE: OFlags = OFlags::WRONLY.union(OFlags::NOCTTY).union(OFlags::CLOEXEC);
     for _ in 0..ATTEMPTS {
         let Place { directory, name, is_open } = locate(path)?;
@@ -352,7 +352,7 @@ fn open_anew(path: &Path) -> io::Result<File> {
         }
         let new = WRITE | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW;
         let file = match openat(&directory.0, &name, new, Mode::from_raw_mode(0o666)) {
-            // Without waiting for the reader of a FIFO.
+            // Does not wait for the reader of a FIFO.
             Err(Errno::EXIST) => {
                 openat(&directory.0, &name, WRITE | OFlags::NOFOLLOW | OFlags::NONBLOCK, Mode::empty())
             }
@@ -363,7 +363,7 @@ fn open_anew(path: &Path) -> io::Result<File> {
             }
         };
         let file = match file {
-            // It went, or a link came, meanwhile.
+            // Meanwhile the file was removed, or a link was created.
             Err(Errno::NOENT | Errno::LOOP) => continue,
             Err(Errno::NXIO) => return Err(io::Error::other("it is a socket, or a FIFO that has no reader")),
             file => file?,
@@ -371,7 +371,7 @@ fn open_anew(path: &Path) -> io::Result<File> {
         fcntl_setfl(&file, OFlags::empty())?;
         let about = fstat(&file)?;
         if FileType::from_raw_mode(about.st_mode) == FileType::RegularFile {
-            // A file system without locks is not refused for it.
+            // A file system without locks is accepted.
             if lock_now(&file) == Err(Errno::WOULDBLOCK) {
                 return Err(io::Error::other("another process is writing it"));
             }
@@ -383,38 +383,38 @@ fn open_anew(path: &Path) -> io::Result<File> {
         }
         return Ok(file.into());
     }
-    Err(io::Error::other("somebody else changes it again and again"))
+    Err(io::Error::other("another process keeps changing it"))
 }
 
-/// Writes a file as [`create`] opens it.
+/// Writes a file that is opened by [`create`].
 ///
 /// # Errors
-/// Those of the system.
+/// Errors of the system.
 pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     io::Write::write_all(&mut create(path)?, bytes)
 }
 
-/// Makes a directory that is not there yet; no link of another user is followed.
+/// Creates a directory that must not exist. Follows no link of another user.
 ///
 /// # Errors
-/// Those of the system.
+/// Errors of the system.
 pub fn create_directory(path: &Path) -> io::Result<()> {
     let Place { directory, name, .. } = locate(path)?;
     let Some(name) = name else { return Err(Errno::EXIST.into()) };
     Ok(mkdirat(&directory.0, name, Mode::from_raw_mode(0o777))?)
 }
 
-/// Makes a directory and those that it lies in, where they are not there; no link of another user is followed.
+/// Creates a directory and its missing parents. Follows no link of another user.
 ///
 /// # Errors
-/// Those of the system.
+/// Errors of the system.
 pub fn create_directories(path: &Path) -> io::Result<()> {
     let mut ancestors: Vec<&Path> = path.ancestors().filter(|path| !path.as_os_str().is_empty()).collect();
     ancestors.reverse();
     for path in ancestors {
         let Place { directory, name: Some(name), .. } = locate(path)? else { continue };
         match mkdirat(&directory.0, &name, Mode::from_raw_mode(0o777)) {
-            // Made by another process meanwhile, perhaps.
+            // Possibly created by another process meanwhile.
             Err(Errno::EXIST) => {
                 let about = statat(&directory.0, &name, AtFlags::SYMLINK_NOFOLLOW)?;
                 if FileType::from_raw_mode(about.st_mode) != FileType::Directory {
@@ -427,11 +427,11 @@ pub fn create_directories(path: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Makes a link in a directory, or puts it in the place of one, in one step: whoever looks finds the old one or the new one.
-/// Nothing is followed that has the link's name.
+/// Creates or replaces a link in a directory in one step: a reader finds the old link or the new one. Nothing that has the
+/// link's name is followed.
 ///
 /// # Errors
-/// Those of the system; [`AlreadyExists`](io::ErrorKind::AlreadyExists) where something else than a link has the name.
+/// Errors of the system; [`AlreadyExists`](io::ErrorKind::AlreadyExists) if something other than a link has the name.
 pub fn link(directory: &Path, name: &str, target: &Path) -> io::Result<()> {
     let Directory(directory) = Directory::open(directory)?;
     match statat(&directory, name, AtFlags::SYMLINK_NOFOLLOW) {
@@ -457,7 +457,7 @@ mod tests {
     fn root() -> bool {
         let root = rustix::process::geteuid().is_root();
         if !root {
-            // Past the harness, which keeps what a test prints.
+            // Bypasses the test harness, which captures printed output.
             let _ = io::Write::write_all(
                 &mut io::stderr(),
                 b"SKIPPED: files of another user because only root can make them\n",
@@ -471,7 +471,7 @@ mod tests {
     }
 
     #[test]
-    fn a_private_directory_is_ours_closed_and_cannot_be_replaced() {
+    fn a_private_directory_is_own_closed_and_cannot_be_replaced() {
         let outer = tempfile::tempdir().unwrap();
         let path = outer.path().join("in");
         let refused = || require_private(&path).unwrap_err().to_string();
@@ -503,7 +503,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_is_written_anew_through_own_links_only() {
+    fn a_file_is_rewritten_through_own_links_only() {
         let directory = tempfile::tempdir().unwrap();
         let at = |name: &str| directory.path().join(name);
         create_directories(&at("a/b/c")).unwrap();
@@ -513,11 +513,11 @@ mod tests {
         symlink(at("short/c/file"), at("link")).unwrap();
         write(&at("link"), b"two").unwrap();
         assert_eq!(fs::read(at("a/b/c/file")).unwrap(), b"two");
-        // A link to nothing makes what it leads to.
+        // A dangling link creates its target.
         symlink("a/new", at("dangling")).unwrap();
         write(&at("dangling"), b"three").unwrap();
         assert_eq!(fs::read(at("a/new")).unwrap(), b"three");
-        // A file's second name is somebody else's business.
+        // A hard link's other name keeps its content.
         fs::hard_link(at("a/new"), at("second")).unwrap();
         write(&at("second"), b"four").unwrap();
         assert_eq!([fs::read(at("a/new")).unwrap(), fs::read(at("second")).unwrap()], [&b"three"[..], b"four"]);
@@ -541,7 +541,7 @@ mod tests {
             assert_eq!(fs::read_link(at("latest")).unwrap(), Path::new(target));
         }
         if root() {
-            // Another user's link is replaced, and what it leads to is left alone.
+            // Another user's link is replaced, and its target is left alone.
             fs::write(at("secret"), b"kept").unwrap();
             fs::remove_file(at("latest")).unwrap();
             symlink("secret", at("latest")).unwrap();
@@ -561,7 +561,7 @@ mod tests {
     }
 
     #[test]
-    fn what_another_user_put_there_leads_nowhere() {
+    fn links_of_another_user_are_not_followed() {
         if !root() {
             return;
         }
@@ -584,12 +584,12 @@ mod tests {
     }
 
     #[test]
-    fn a_file_may_be_written_anew_as_soon_as_its_writer_is_dropped() {
+    fn a_file_can_be_rewritten_as_soon_as_its_writer_is_dropped() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("file");
         let first = create(&path).unwrap();
         assert!(create(&path).is_err(), "it is being written");
-        // As a process has it that was just forked.
+        // As in a process that was just forked.
         let _copy = first.try_clone().unwrap();
         drop(first);
         create(&path).unwrap();

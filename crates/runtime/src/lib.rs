@@ -1,29 +1,29 @@
-//! The loop of corotate as processes: scenarios, links over shared memory, clocks, nodes, scores.
+//! The control loop of corotate: scenarios, links over shared memory, clocks, nodes, scores.
 //!
-//! This file is the map of the crate and holds no logic. The program and its facade are the crate `corotate`, which re-exports every
-//! module of this one and of `corotate-core`, on which it stands. Arrows between modules point down only:
+//! This file is the map of the crate and holds no logic. The crate `corotate` is the program and its facade: it re-exports every
+//! module of this crate and of `corotate-core`, on which this crate builds. A module depends only on modules further down:
 //!
 //! | module | duty |
 //! |---|---|
-//! | `seat` | a role as a process: of this program, a function, a device, a foreign program |
-//! | `scenario` | a scenario with its rig: the generic code below behind a table of functions; the registry of rigs |
+//! | `seat` | the process of a role: of this program, a function, a device, an external program |
+//! | `scenario` | a scenario with its rig, behind a table of functions; the registry of rigs |
 //! | `direct` | a run in one thread without links |
-//! | `analysis` | what may be claimed of the loop that runs: its rate, its floor |
+//! | `analysis` | the claims about the running loop: its rate and its error floor |
 //! | `score` | scores a run from the truth and the estimates |
-//! | `runtime` | drives one role on a bus with a clock |
-//! | `rig` | which plant, observer and law belong together |
+//! | `runtime` | drives a role on a bus with a clock |
+//! | `rig` | a plant, an observer and a law that belong together |
 //! | `failure` | errors with their codes |
-//! | `data` | logs that others wrote, read row by row |
+//! | `data` | logs of other programs, read row by row |
 //! | `config` | scenario files: text with its checks, and the settings of a run |
 //! | `telemetry` | histograms and counters, exported after the loop |
 //! | `bus` | links between roles: shared memory (iceoryx2) or in-memory |
-//! | `clock` | the time grid and how to wait on it |
-//! | `shared` | words of memory that processes share |
-//! | `panics` | the message and place of a panic, and whose code it is in |
-//! | `files` | files beside other users: what is this user's alone, and where what is written goes |
-//! | `system` | what the operating system says: errors with their remedies |
+//! | `clock` | the time grid, and waiting for it |
+//! | `shared` | words of memory shared between processes |
+//! | `panics` | the message and place of a panic, and the crate it is in |
+//! | `files` | files on a machine with other users: private directories, safe creation |
+//! | `system` | operating-system errors with their remedies |
 
-// The exported macros name the facade, which re-exports what they need.
+// The exported macros use paths of the facade.
 #[cfg(test)]
 extern crate corotate_core as corotate;
 use corotate_core::{control, estimate, fault, identify, model, observe, rate, role, sample, serial, state, vector};

@@ -1,7 +1,7 @@
-//! Panics: what they say, where they are, and whose code that is.
+//! Panics: message, place, and the crate that they occur in.
 //!
-//! A user's law may panic: its message and place come first, and nothing calls it a defect of this crate. Must not end the
-//! process; the caller that catches a panic decides.
+//! A panic of a user's law is not reported as a defect of this crate. This file does not end the process; the caller that
+//! catches a panic decides.
 
 use crate::files;
 use serde::{Deserialize, Serialize};
@@ -13,11 +13,11 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Letters of a message that are kept, and those of it that are put into a line.
+/// The largest number of characters of a message that are kept, and the largest number printed on a line.
 const MESSAGE_MAX: usize = 4096;
 const LINE_MAX: usize = 400;
 
-/// One panic.
+/// A panic.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Panic {
     /// File, line and column.
@@ -41,13 +41,13 @@ impl Display for Panic {
 impl Panic {
     fn at(info: &PanicHookInfo<'_>) -> Self {
         let place = info.location().map_or("an unknown place".to_owned(), ToString::to_string);
-        Self { place, message: "its message could not be written".to_owned() }
+        Self { place, message: "its message could not be formatted".to_owned() }
     }
 
-    fn of(info: &PanicHookInfo<'_>) -> Self {
+    fn from_hook(info: &PanicHookInfo<'_>) -> Self {
         let payload = info.payload();
         let words = payload.downcast_ref::<String>().map(String::as_str).or(payload.downcast_ref().copied());
-        let words = words.unwrap_or("a value that is no text").trim();
+        let words = words.unwrap_or("a value that is not text").trim();
         let mut message: String = words.chars().take(MESSAGE_MAX).collect();
         if message.len() < words.len() {
             message += "...";
@@ -55,17 +55,17 @@ impl Panic {
         Self { message, ..Self::at(info) }
     }
 
-    fn tell(&self, tell: fn(&dyn Display)) {
+    fn report(&self, print: fn(&dyn Display)) {
         let Self { place, message } = self;
         match self.is_ours() {
-            true => tell(&format!(
+            true => print(&format!(
                 "a defect of corotate or of iceoryx2 at {place}: {message}; run it again, and report this line"
             )),
-            false => tell(&format!("panicked at {place}: {message}")),
+            false => print(&format!("panicked at {place}: {message}")),
         }
     }
 
-    /// Returns true if the panic is in code of this project or of iceoryx2: then it is a defect of theirs.
+    /// Returns true if the panic is a defect of this project or of iceoryx2, judged by its place.
     pub fn is_ours(&self) -> bool {
         [Some(file!()), Some(corotate_core::FILE), FACADE.get().copied()]
             .into_iter()
@@ -73,13 +73,13 @@ impl Panic {
             .any(|file| is_within(&self.place, file))
     }
 
-    /// Returns true if both are the same but for numbers in their messages.
-    pub fn is_like(&self, other: &Self) -> bool {
+    /// Returns true if both panics have the same place and the same message apart from numbers.
+    pub fn is_like(&self, panic: &Self) -> bool {
         let words = |panic: &Self| panic.message.chars().filter(|letter| letter.is_alphabetic()).collect::<String>();
-        self.place == other.place && words(self) == words(other)
+        self.place == panic.place && words(self) == words(panic)
     }
 
-    /// The panic that a process has left in this file, which is removed: a successor leaves its own.
+    /// Reads and removes the file in which a process left its panic, so that a successor can leave its own.
     pub fn take(path: &Path) -> Option<Self> {
         let text = std::fs::read(path).ok()?;
         let _ = std::fs::remove_file(path);
@@ -87,52 +87,52 @@ impl Panic {
     }
 }
 
-/// Returns true if a place is in the crate that has this file at its root, or in one of iceoryx2's.
+/// Returns true if the place is in the crate with this root file, or in a crate of iceoryx2.
 fn is_within(place: &str, file: &str) -> bool {
     let sources = file.rfind('/').map_or("", |end| &file[..=end]);
     place.starts_with(sources) || place.split('/').any(|part| part.starts_with("iceoryx2"))
 }
 
-/// A file at the root of the facade's sources.
+/// The root file of the facade's sources.
 static FACADE: OnceLock<&str> = OnceLock::new();
 
-/// Where the first panic of this process is kept.
+/// The file that receives the first panic of this process.
 static KEPT: OnceLock<PathBuf> = OnceLock::new();
-static KEPT_ONE: AtomicBool = AtomicBool::new(false);
+static IS_KEPT: AtomicBool = AtomicBool::new(false);
 
 thread_local! {
-    /// While this thread catches panics: whether they are silent, and the one that was caught.
+    /// While this thread catches panics: true if they are silent, and the first caught one.
     static CAUGHT: RefCell<Option<(bool, Option<Panic>)>> = const { RefCell::new(None) };
 }
 
-/// Keeps the first panic of this process in a file, from which the launcher reads why the process ended.
+/// Makes this process write its first panic to a file, from which the launcher reads why the process ended.
 pub fn keep_in(path: PathBuf) {
     let _ = KEPT.set(path);
 }
 
-/// Tells every panic by `tell`, first its message and place, and with RUST_BACKTRACE where it came from. `facade` is a file at the root
-/// of the facade's sources: a panic below it is a defect of the facade.
-pub fn set_hook(facade: &'static str, tell: fn(&dyn Display)) {
+/// Installs a hook that passes every panic to `print`: message and place first, then the backtrace if RUST_BACKTRACE asks for it.
+/// `facade` is a file at the root of the facade's sources: a panic below it is a defect of the facade.
+pub fn set_hook(facade: &'static str, print: fn(&dyn Display)) {
     let _ = FACADE.set(facade);
     std::panic::set_hook(Box::new(move |info| {
-        let first = KEPT.get().filter(|_| !KEPT_ONE.swap(true, Ordering::Relaxed));
+        let first = KEPT.get().filter(|_| !IS_KEPT.swap(true, Ordering::Relaxed));
         let keep = |panic: &Panic| {
             let written = first.map(|path| files::write(path, &serde_json::to_vec(panic).unwrap_or_default()));
-            // Without the file the launcher has the exit code.
+            // Without the file, the launcher still has the exit code.
             let _ = written;
         };
-        // Before its message, which may panic in its turn and end the process.
+        // Written before the message is formatted: formatting may panic and end the process.
         keep(&Panic::at(info));
-        let panic = Panic::of(info);
+        let panic = Panic::from_hook(info);
         keep(&panic);
         let quiet = CAUGHT.try_with(|caught| match &mut *caught.borrow_mut() {
             Some((quiet, caught @ None)) => {
                 *caught = Some(panic.clone());
                 *quiet
             }
-            // A panic while the caught one unwinds ends the process.
+            // A second panic while the first one unwinds ends the process.
             Some((true, Some(before))) => {
-                before.tell(tell);
+                before.report(print);
                 false
             }
             _ => false,
@@ -140,15 +140,15 @@ pub fn set_hook(facade: &'static str, tell: fn(&dyn Display)) {
         if quiet.unwrap_or(false) {
             return;
         }
-        panic.tell(tell);
+        panic.report(print);
         let trace = Backtrace::capture();
         if trace.status() == BacktraceStatus::Captured {
-            tell(&trace);
+            print(&trace);
         }
     }));
 }
 
-/// Calls a function, and gives its panic, which is told.
+/// Calls a function and catches its panic, which is printed.
 ///
 /// # Errors
 /// The panic.
@@ -168,7 +168,7 @@ fn catch_as<T>(quiet: bool, call: impl FnOnce() -> T) -> Result<T, Panic> {
     CAUGHT.set(Some((quiet, None)));
     let returned = catch_unwind(AssertUnwindSafe(call));
     let caught = CAUGHT.take().and_then(|(_, caught)| caught);
-    // A program that has a hook of its own has told it.
+    // A program with its own hook has printed it.
     let unknown = || Panic { place: "an unknown place".to_owned(), message: "see above".to_owned() };
     returned.map_err(|_| caught.unwrap_or_else(unknown))
 }
@@ -200,23 +200,23 @@ mod tests {
     }
 
     #[test]
-    fn a_line_has_place_and_message_whatever_the_message_is() {
-        let told = panic("src/main.rs:3:5", "first\n\n  second\u{1b}[31m").to_string();
-        assert_eq!(told, "it panicked at src/main.rs:3:5: first | second\\u{1b}[31m");
+    fn a_line_has_place_and_message_for_any_message() {
+        let line = panic("src/main.rs:3:5", "first\n\n  second\u{1b}[31m").to_string();
+        assert_eq!(line, "it panicked at src/main.rs:3:5: first | second\\u{1b}[31m");
         let long = panic("src/main.rs:3:5", &"é".repeat(10_000)).to_string();
         assert!(long.chars().count() < LINE_MAX + 50 && long.ends_with("é..."), "{long}");
     }
 
     #[test]
     fn panics_are_alike_but_for_numbers() {
-        let one = panic("a.rs:1:1", "rate 3.17e-2 at tick 500");
-        assert!(one.is_like(&panic("a.rs:1:1", "rate 9.1e+3 at tick 7")));
-        assert!(!one.is_like(&panic("a.rs:2:1", "rate 3.17e-2 at tick 500")));
-        assert!(!one.is_like(&panic("a.rs:1:1", "no rate at tick 500")));
+        let first = panic("a.rs:1:1", "rate 3.17e-2 at tick 500");
+        assert!(first.is_like(&panic("a.rs:1:1", "rate 9.1e+3 at tick 7")));
+        assert!(!first.is_like(&panic("a.rs:2:1", "rate 3.17e-2 at tick 500")));
+        assert!(!first.is_like(&panic("a.rs:1:1", "no rate at tick 500")));
     }
 
     #[test]
-    fn what_is_no_text_is_a_panic_too() {
+    fn a_panic_without_text_is_caught() {
         assert_eq!(catch(|| 3), Ok(3));
         assert!(catch(|| std::panic::panic_any(7_u32)).is_err());
     }

@@ -1,10 +1,10 @@
-//! Memory shared between the processes of a run: a file in /dev/shm, mapped, and seen as atomics of one width.
+//! Memory shared between the processes of a run: a mapped file in /dev/shm, accessed as atomics of one width.
 //!
-//! The mapping itself orders nothing. A process that stores with Release hands over everything that it wrote before, in this
-//! mapping or another, to whoever loads that value with Acquire; a value that stands for itself alone may be Relaxed. Nothing
-//! orders a process that dies against its successor but the file's lock: the kernel releases it after the last store.
+//! The mapping itself orders nothing. A Release store makes everything that the process wrote before, in any mapping, visible
+//! to a process that loads the value with Acquire. A value that depends on no other may be Relaxed. Between a process that
+//! dies and its successor only the file's lock orders accesses: the kernel releases it after the last store.
 //!
-//! Must not know what the atomics mean.
+//! This file does not know what the atomics mean.
 
 use crate::files::{open_with, require_own};
 use memmap2::MmapRaw;
@@ -16,27 +16,27 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 
-/// Bytes of the smallest page that there is.
+/// The size of the smallest page, bytes.
 const PAGE_BYTES: usize = 4096;
 
-/// Words of 64 bits in a file that processes share.
+/// 64-bit words in a file shared between processes.
 pub type SharedWords = Shared<AtomicU64>;
-/// Words of 32 bits in a file that processes share: the kernel can wait on them.
+/// 32-bit words in a file shared between processes. The kernel can wait on them.
 pub type SharedHalves = Shared<AtomicU32>;
 
-/// Atomics in a file that processes share. A mapping has one width, because accesses of two widths to the same bytes are a
-/// data race even where both are atomic; every process that maps the file names the same one.
+/// Atomics in a file shared between processes. A mapping has one width: accesses of two widths to the same bytes are a data
+/// race, even if both are atomic. Every process that maps the file must use the same width.
 #[derive(Debug)]
 pub struct Shared<A> {
     map: MmapRaw,
-    /// Kept open for the locks that somebody may have on it; the kernel lets go of them when the process dies.
+    /// Open for the locks held on it, which the kernel releases when the process dies.
     file: File,
     width: PhantomData<A>,
 }
 
-/// An atomic of which a mapping may be made: any bytes are a value of it, and it needs no more than a page's alignment.
+/// An atomic that can be mapped: any bytes are a valid value, and page alignment suffices.
 pub trait Atomic: sealed::Sealed {
-    /// Writes what is there.
+    /// Writes the current value again.
     fn touch(&self);
 }
 
@@ -58,7 +58,8 @@ impl Atomic for AtomicU32 {
     }
 }
 
-/// Opens a file of ours, through no link: somebody else could shorten his, and whoever touches what is gone is killed.
+/// Opens a file of this user, and follows no link. Another user could shorten a foreign file, and access beyond its end kills
+/// the process.
 fn open(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
     let file = open_with(path, options.read(true).write(true), OFlags::NOFOLLOW)?;
     require_own(&file)?;
@@ -66,7 +67,7 @@ fn open(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
 }
 
 impl<A: Atomic> Shared<A> {
-    /// The atomics in a file as they were left, or so many new ones, all zero. How many there are is for the caller to check.
+    /// Opens the atomics in a file, or creates `count` new ones, all zero. The caller checks the number of existing ones.
     ///
     /// # Errors
     /// The system's reason.
@@ -74,7 +75,7 @@ impl<A: Atomic> Shared<A> {
         let bytes = (count * size_of::<A>()) as u64;
         let file = open(path, OpenOptions::new().create(true).truncate(false).mode(0o600))?;
         if file.metadata()?.len() == 0 {
-            // Really allocated, not merely promised: a page that is missing later would kill the process.
+            // Allocated now: a page that cannot be allocated later would kill the process.
             fallocate(&file, FallocateFlags::empty(), 0, bytes)?;
         }
         let shared = Self { map: MmapRaw::map_raw(&file)?, file, width: PhantomData };
@@ -82,23 +83,23 @@ impl<A: Atomic> Shared<A> {
         Ok(shared)
     }
 
-    /// Writes to every page, nothing new: who writes a little at every tick shall not come upon a new one in the midst of it.
-    /// A mapping that is populated by the system is so for reading only, and faults once more when it is written.
+    /// Writes to every page without changing it, so that no later write faults. Pages populated by the kernel are mapped for
+    /// reading and fault once more at the first write.
     fn touch(&self) {
         self.atomics().chunks(PAGE_BYTES / size_of::<A>()).for_each(|page| page[0].touch());
     }
 
-    /// The atomics in a file that must be there.
+    /// Opens the atomics in an existing file.
     ///
     /// # Errors
     /// The system's reason.
     pub fn existing(path: &Path) -> io::Result<Self> {
         let file = open(path, &mut OpenOptions::new())?;
-        // An empty mapping is refused by the system itself.
+        // The system refuses an empty mapping.
         Ok(Self { map: MmapRaw::map_raw(&file)?, file, width: PhantomData })
     }
 
-    /// The file. A lock on it ends with this value.
+    /// Returns the file. A lock on it ends with this value.
     pub fn file(&self) -> &File {
         &self.file
     }
@@ -106,22 +107,22 @@ impl<A: Atomic> Shared<A> {
     #[inline]
     #[allow(unsafe_code)]
     fn atomics(&self) -> &[A] {
-        // SAFETY: the mapping is writable, page-aligned, at least `len` bytes long (the file was allocated so, and no
-        // process of a run shortens it), and lives as long as `self`; any bytes are an `A`, by `Atomic`; every access to
-        // them, in any process, is atomic and of this width.
+        // SAFETY: the mapping is writable and page-aligned, and lives as long as `self`. It has the length of the file, which was
+        // allocated and which no process of a run shortens. Any bytes are a valid `A`, by `Atomic`. Every process accesses them
+        // atomically and with this width.
         unsafe { std::slice::from_raw_parts(self.map.as_ptr().cast::<A>(), self.map.len() / size_of::<A>()) }
     }
 }
 
 impl<A> Drop for Shared<A> {
     fn drop(&mut self) {
-        // Closing it is not enough: a process that was forked meanwhile has the file too.
+        // Closing is not enough: a process forked meanwhile holds the file too.
         let _ = self.file.unlock();
     }
 }
 
 impl SharedWords {
-    /// All words.
+    /// Returns all words.
     #[inline]
     pub fn words(&self) -> &[AtomicU64] {
         self.atomics()
@@ -129,14 +130,14 @@ impl SharedWords {
 }
 
 impl SharedHalves {
-    /// All words of 32 bits.
+    /// Returns all 32-bit words.
     #[inline]
     pub fn halves(&self) -> &[AtomicU32] {
         self.atomics()
     }
 }
 
-/// A mapping has the atomics of its width only.
+/// A mapping offers only atomics of its width.
 ///
 /// ```compile_fail,E0599
 /// # extern crate corotate_runtime as corotate;
@@ -159,7 +160,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_one_mapping_publishes_another_sees() {
+    fn stores_in_one_mapping_are_visible_in_another() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("words");
         let (here, there) = (SharedWords::open(&path, 1000).unwrap(), SharedWords::existing(&path).unwrap());
@@ -179,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_keeps_its_length_and_what_is_in_it() {
+    fn a_file_keeps_its_length_and_content() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("halves");
         SharedHalves::open(&path, 2048).unwrap().halves()[2047].store(7, Ordering::Relaxed);

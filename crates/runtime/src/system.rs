@@ -1,5 +1,5 @@
-//! The system: its errors in words, with what a user can do about them, its stderr, its time of day, and its randomness. Must not
-//! decide what becomes of the program.
+//! The operating system: errors with their remedies, standard error, time of day and random numbers. The caller decides whether
+//! the program ends.
 
 use rustix::io::retry_on_intr;
 use rustix::rand::{GetRandomFlags, getrandom};
@@ -11,19 +11,20 @@ use std::process::Command;
 use std::sync::OnceLock;
 use std::time::SystemTime;
 
-/// The file that this program is started from, and what it is given before all else.
+/// The file and the first arguments that start this program.
 static PROGRAM: OnceLock<(PathBuf, Vec<OsString>)> = OnceLock::new();
 
-/// Says how this program is started, where that is not by the file that runs: as a library in an interpreter. Once, before
-/// anything is started.
+/// Sets the command that starts this program, if it is not the running executable, as for a library in an interpreter. Call it
+/// once, before any process is started.
 pub fn started_by(file: PathBuf, arguments: Vec<OsString>) {
     let _ = PROGRAM.set((file, arguments));
 }
 
-/// This program, to be started again: as a role, as the janitor. The same file whatever has taken its place since.
+/// Returns a command that starts this program again, as a role or as the janitor. It uses the same file even if that was
+/// replaced.
 ///
 /// # Errors
-/// Those of the system, where it does not tell the file.
+/// Errors of the system, if it does not name the executable.
 pub fn this_program() -> io::Result<Command> {
     if PROGRAM.get().is_none() {
         started_by(std::env::current_exe()?, Vec::new());
@@ -34,12 +35,12 @@ pub fn this_program() -> io::Result<Command> {
     Ok(command)
 }
 
-/// A time in UTC as text (RFC 3339), from 1970 on.
+/// Formats a time as UTC (RFC 3339); times before 1970 become 1970.
 pub fn utc(time: SystemTime) -> String {
     humantime::format_rfc3339(time.max(SystemTime::UNIX_EPOCH)).to_string()
 }
 
-/// What to do about an error of the system.
+/// Returns the remedy for an error of the system.
 pub fn remedy(error: &io::Error) -> &'static str {
     match error.raw_os_error() {
         Some(libc::ENOSPC | libc::EDQUOT) => "free some room there",
@@ -53,26 +54,26 @@ pub fn remedy(error: &io::Error) -> &'static str {
         Some(libc::ENOENT) => "check that it exists",
         Some(libc::EISDIR) => "name a file in it",
         Some(libc::ENOTDIR) => "check its path: a part of it is a file",
-        Some(libc::EIO) => "check the device: `dmesg` tells more",
+        Some(libc::EIO) => "check the device: see `dmesg`",
         Some(libc::ENOLCK | libc::EOPNOTSUPP | libc::ENOSYS) => "the file system cannot do that: choose another place",
         _ => "try again; `corotate doctor` examines the machine",
     }
 }
 
-/// 128 bits that nobody can guess.
+/// Returns 128 unpredictable random bits.
 ///
 /// # Errors
 /// The system's reason.
 pub fn random_bits() -> io::Result<u128> {
     let mut bytes = [0; size_of::<u128>()];
-    // As few as these are given at once.
+    // So few bytes are returned by a single call.
     match retry_on_intr(|| getrandom(&mut bytes, GetRandomFlags::empty()))? {
         16 => Ok(u128::from_ne_bytes(bytes)),
         _ => Err(io::ErrorKind::UnexpectedEof.into()),
     }
 }
 
-/// Writes a line to stderr. Without a stderr the exit code is all there is to say, where `eprintln!` would panic.
+/// Writes a line to stderr. A missing stderr is ignored, where `eprintln!` would panic; the exit code still tells the result.
 pub fn tell(line: impl Display) {
     let _ = writeln!(io::stderr(), "{line}");
 }

@@ -1,6 +1,6 @@
-//! A rig behind a table of functions: what the program asks of a rig whose type it does not know, answered once for every [`Rig`].
+//! A rig behind a table of functions, for code that does not know its type. Every [`Rig`] implements it.
 //!
-//! Must not compute anything: each answer is the generic code of a module below.
+//! Nothing is computed here: each function calls the generic code of a module below.
 
 use crate::analysis::{self, Claim};
 use crate::bus::{AnyBus, BusError};
@@ -13,21 +13,21 @@ use crate::telemetry::{Ledger, RoleReport};
 use std::any::Any;
 use std::fmt;
 
-/// Any rig.
+/// A rig of any type.
 pub trait AnyRig: WordView + Any + Send + Sync {
-    /// The bodies; the first is the observed one.
+    /// Returns the bodies; the first is the observed one.
     fn bodies(&self) -> &[BodyInfo];
-    /// The metrics by which a run is scored.
+    /// Returns the names of the metrics of a run.
     fn metrics(&self) -> Vec<&'static str>;
-    /// The proofs about the closed loop, one per driven body.
+    /// Returns the proofs about the closed loop, one per driven body.
     fn certificates(&self) -> Vec<CertificateReport>;
-    /// The physical bounds that the guards work with.
+    /// Returns the physical bounds that the guards use.
     fn limits(&self) -> Vec<Figure>;
-    /// The quantities that the controller can watch, each with the reason why it cannot in this scenario, if so.
+    /// Returns the quantities that the controller can watch. A reason is given for each that cannot be watched in this scenario.
     fn monitors(&self) -> Vec<(&'static str, Option<&'static str>)>;
-    /// Notes for readers of the results.
+    /// Returns notes for readers of the results.
     fn notes(&self) -> Vec<String>;
-    /// The pictures of the motion in a report.
+    /// Returns the pictures of the motion in a report.
     fn pictures(&self) -> Vec<Picture>;
     /// See [`Rig::counterpart`].
     fn counterpart(&self) -> &'static [&'static str];
@@ -49,14 +49,14 @@ pub trait AnyRig: WordView + Any + Send + Sync {
     /// # Errors
     /// [`BusError::Open`].
     fn scorer(&self, settings: &Settings, bus: AnyBus<'_>) -> Result<Box<dyn Scorer>, BusError>;
-    /// Runs the roles one after the other in this thread, on samples that stay in place; none if the nodes must run them.
+    /// Runs the roles in this thread, on samples that stay in place. Returns `None` if the run needs nodes and links.
     fn direct(
         &self,
         settings: &Settings,
         checkpoints: bool,
         proceed: &mut dyn FnMut(u64, f64) -> bool,
     ) -> Option<(Vec<RoleReport>, Score)>;
-    /// Returns the ticks per second of the roles' mathematics alone; none for other rigs than a leader with one follower.
+    /// Returns the ticks per second of the roles' mathematics alone; `None` unless the rig is a leader with one follower.
     fn arithmetic(&self, settings: &Settings, hashed: bool) -> Option<f64>;
 }
 
@@ -132,12 +132,12 @@ impl<R: Rig> AnyRig for R {
 }
 
 impl dyn AnyRig {
-    /// The rig, if it is of this type.
+    /// Returns the rig if it is of this type.
     pub fn downcast_ref<R: Rig>(&self) -> Option<&R> {
         (self as &dyn Any).downcast_ref()
     }
 
-    /// The names of all roles, in the order in which one tick passes through them.
+    /// Returns the names of all roles, in the order in which a tick passes through them.
     pub fn roles(&self) -> Vec<&str> {
         role_names(self.bodies())
     }

@@ -1,4 +1,4 @@
-//! A scenario as resolved: every value checked, every default filled in, its rig made; ready to run.
+//! A resolved scenario: every value checked, every default filled in, its rig created; ready to run.
 //!
 //! | file | duty |
 //! |---|---|
@@ -6,8 +6,8 @@
 //! | `registry` | the rigs that scenarios of this program may name |
 //! | `schema` | a JSON Schema of scenarios |
 //!
-//! Modules below know a scenario as its [`Settings`], and the rig as a type parameter. Must not touch the machine beyond reading
-//! the file.
+//! Modules below know a scenario as its [`Settings`], and the rig as a type parameter. This module reads the scenario file and
+//! nothing else of the machine.
 
 mod any;
 mod registry;
@@ -37,33 +37,33 @@ use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// The slowest tick: a period must lie well within what a latency histogram holds.
+/// The slowest tick rate: a period must lie well within the range of a latency histogram.
 const MIN_TICK_HZ: f64 = 0.1;
-/// The fastest tick: beyond it the clock reads alone would fill the period.
+/// The fastest tick rate: beyond it, reading the clock alone fills the period.
 const MAX_TICK_HZ: f64 = 1e5;
-/// The most ticks of one run: ten years at 1 kHz.
+/// The largest number of ticks of a run: ten years at 1 kHz.
 const MAX_TICKS: f64 = 3.2e11;
-/// The keys that hold one table each, whatever the rig.
+/// The keys of every scenario that hold one table each.
 const TABLES: [&str; 7] = ["actuator", "realtime", "launch", "supervision", "watchdog", "network", "accept"];
 
-/// The bounds of the watchdog, by their keys, which are the rig's.
+/// The bounds of the watchdog by key; the keys depend on the rig.
 #[derive(Deserialize)]
 struct Maxima {
     #[serde(default)]
     watchdog: BTreeMap<String, f64>,
 }
 
-/// A scenario that can be run: its settings, with the rig and the file that they come from.
+/// A scenario that can be run: its settings, its rig, and its text.
 #[derive(Debug)]
 pub struct Scenario {
     settings: Settings,
     /// Bodies, observer and laws.
     pub rig: Arc<dyn AnyRig>,
-    /// The scenario as a file that resolves to itself.
+    /// The resolved scenario as TOML. It resolves to the same scenario.
     pub resolved: toml::Table,
-    /// Files that it names: key and path.
+    /// The files that the scenario names, with their keys.
     pub files: Vec<(String, PathBuf)>,
-    /// Settings without effect in a run of this length, by key.
+    /// Warnings about settings that have no effect in a run of this length, by key.
     pub warnings: Vec<String>,
 }
 
@@ -82,15 +82,15 @@ impl DerefMut for Scenario {
 }
 
 impl Scenario {
-    /// Reads a file, applies overrides, checks everything.
+    /// Reads a scenario file, applies overrides and checks everything.
     ///
     /// # Errors
-    /// [`ConfigError`], with the place, the reason and the remedy.
+    /// [`ConfigError`], with place, reason and remedy.
     pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
         Self::changed(Document::read(path)?, overrides)
     }
 
-    /// The same from a text; `origin` stands for the file in error messages.
+    /// Does the same for a text; `origin` stands for the file in error messages.
     ///
     /// # Errors
     /// [`ConfigError`].
@@ -103,7 +103,7 @@ impl Scenario {
         Self::resolve(document)
     }
 
-    /// The same from a document, with whatever was changed in it.
+    /// Resolves a document.
     ///
     /// # Errors
     /// [`ConfigError`].
@@ -117,22 +117,22 @@ impl Scenario {
         let (raw, metrics) = match (document.read_into::<Raw>(), metrics) {
             (Ok(raw), Ok(metrics)) => (raw, metrics.accept),
             (raw, metrics) => {
-                // The rig's own sections are read all the same; of what they say nothing can be judged.
+                // The rig's own tables are read too, to report their mistakes, but their values cannot be checked.
                 let context = Context { tick_s: 1.0 / MAX_TICK_HZ, duration_s: 1.0, seed: 0, actuation_delay_ticks: 1 };
                 let own = document.text("rig").map(|rig| registry::resolve(rig, &sections, context, &mut checks));
                 let rig = own.as_ref().and_then(|own| own.as_ref().ok()?.0.as_deref());
                 let nested = nested_keys(document.text("rig"), rig);
                 checks.retain(|key| key == "rig");
-                let others = checks.finish::<()>(None).err();
+                let rig_errors = checks.finish::<()>(None).err();
                 let errors = raw.err().map(|error| error.within(&nested)).into_iter().chain(metrics.err());
-                let mut errors = errors.chain(own.and_then(Result::err)).chain(others);
-                let first = errors.next().expect("one of them was refused");
+                let mut errors = errors.chain(own.and_then(Result::err)).chain(rig_errors);
+                let first = errors.next().expect("at least one error");
                 return Err(first.and(errors));
             }
         };
         check_common(&raw, &mut checks);
         let period_ns = (1e9 / raw.tick_hz).round() as u64;
-        // A tick that is refused is not complained of by the rig too: the shortest one stands in for it.
+        // For a refused tick rate, the rig gets the shortest tick, so that it does not report the same mistake.
         let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 1.0 / MAX_TICK_HZ };
         let length_s = if length_possible(&raw) { raw.duration_s } else { 0.0 };
         let actuation_delay_ticks = raw.actuation_delay_ticks.clamp(1, ACTUATION_DELAY_MAX);
@@ -142,7 +142,7 @@ impl Scenario {
             Err(error) => return Err(error.and(checks.finish::<()>(None).err())),
         };
         let last_tick = (raw.duration_s * 1e9 / period_ns as f64).round() as u64;
-        // Nothing is concluded from a length or a tick that is refused.
+        // A refused length or tick rate leads to no further errors.
         let duration_s = if length_possible(&raw) { raw.duration_s } else { f64::INFINITY };
         let accept = resolve_accept(&raw, &metrics, duration_s, rig.as_deref(), &mut checks);
         check_external(&raw, rig.as_deref().map(<dyn AnyRig>::roles), &mut checks);
@@ -206,7 +206,7 @@ impl Scenario {
         Ok(Self { settings, rig, resolved, files, warnings })
     }
 
-    /// Returns notes for readers of the results: on the tick, and on the rig.
+    /// Returns notes for readers of the results: on a rounded period, and those of the rig.
     pub fn notes(&self) -> Vec<String> {
         let real_hz = 1e9 / self.period_ns as f64;
         let part = real_hz / self.tick_hz - 1.0;
@@ -217,23 +217,23 @@ impl Scenario {
         rounded.into_iter().chain(self.rig.notes()).collect()
     }
 
-    /// The scenario as the file of its run, which the first line names.
+    /// Returns the text of the scenario file of its run; the first line names the run.
     pub fn to_file(&self) -> String {
         self.run.map_or(String::new(), |run| format!("# {}\n", run.comment())) + &self.to_toml()
     }
 
-    /// The scenario as the text of a file.
+    /// Returns the scenario as the text of a file.
     pub fn to_toml(&self) -> String {
         toml::to_string(&self.resolved).expect("a scenario of plain values is TOML")
     }
 }
 
-/// Returns what may be claimed of every driven body's loop.
+/// Returns the claims about every driven body's loop.
 pub fn claims(scenario: &Scenario) -> Vec<Claim> {
     scenario.rig.claims(scenario)
 }
 
-/// Opens a role's links and builds its node, with its counters in the ledger: new, or a predecessor's.
+/// Opens a role's links and builds its node. Its counters are in the ledger, which may hold those of a predecessor.
 ///
 /// # Errors
 /// [`BusError::Open`].
@@ -254,7 +254,7 @@ pub fn scorer<'a>(scenario: &Scenario, bus: impl Into<AnyBus<'a>>) -> Result<Box
     scenario.rig.scorer(scenario, bus.into())
 }
 
-/// Checks the criteria against what is known of the rig.
+/// Checks the acceptance criteria, as far as the rig is known.
 fn resolve_accept(
     raw: &Raw,
     metrics: &toml::Table,
@@ -269,7 +269,7 @@ fn resolve_accept(
     accept::resolve(&raw.accept, metrics, &setting, checks)
 }
 
-/// The keys of tables, as `accept.settled_by_s`, with those that the rig of this name gives names to.
+/// Returns the keys within tables, as `accept.settled_by_s`, including those that the rig defines.
 fn nested_keys(name: Option<&str>, rig: Option<&dyn AnyRig>) -> Vec<String> {
     let mut nested = Vec::new();
     let shapes = registry::shapes();
@@ -293,7 +293,7 @@ fn tick_possible(tick_hz: f64) -> bool {
     (MIN_TICK_HZ..=MAX_TICK_HZ).contains(&tick_hz)
 }
 
-/// Whether a run can have so many ticks. Where the tick is refused, no number of ticks is known.
+/// Returns true if the number of ticks is within the limits, or unknown because the tick rate is refused.
 fn length_possible(raw: &Raw) -> bool {
     !tick_possible(raw.tick_hz) || (1.0..=MAX_TICKS).contains(&(raw.duration_s * raw.tick_hz))
 }
@@ -321,13 +321,13 @@ fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
         "out-of-range",
         || {
             format!(
-                "no command acts {} ticks after its measurement; give 1 (the next tick) to {ACTUATION_DELAY_MAX}",
+                "a command cannot act {} ticks after its measurement; give 1 (the next tick) to {ACTUATION_DELAY_MAX}",
                 raw.actuation_delay_ticks
             )
         },
     );
     checks.require(raw.actuator.command_timeout_ticks >= 1, "actuator.command_timeout_ticks", "out-of-range", || {
-        "0 would make every tick unsafe; give at least 1".to_owned()
+        "0 would apply the safe command at every tick; give at least 1".to_owned()
     });
     check_realtime(&raw.realtime, checks);
     check_supervision(&raw.supervision, checks);
@@ -335,11 +335,11 @@ fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
         (0.1..=3600.0).contains(&raw.launch.startup_timeout_s),
         "launch.startup_timeout_s",
         "out-of-range",
-        || format!("{} s is no time to wait for roles; give 0.1 to 3600", raw.launch.startup_timeout_s),
+        || format!("{} s is out of range; give 0.1 to 3600", raw.launch.startup_timeout_s),
     );
     if let Some(timeout_s) = raw.launch.external_timeout_s {
         checks.require((0.1..=604_800.0).contains(&timeout_s), "launch.external_timeout_s", "out-of-range", || {
-            format!("{timeout_s} s is no time to wait for an external role; give 0.1 to 604800, or leave it out")
+            format!("{timeout_s} s is out of range; give 0.1 to 604800, or remove it")
         });
     }
 }
@@ -347,25 +347,25 @@ fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
 fn check_supervision(supervision: &Supervision, checks: &mut Checks<'_>) {
     let (heartbeat_s, interval_s) = (supervision.heartbeat_timeout_s, supervision.restart_interval_s);
     checks.require((0.1..=3600.0).contains(&heartbeat_s), "supervision.heartbeat_timeout_s", "out-of-range", || {
-        format!("{heartbeat_s} s is no time to wait for a word that is due every 0.02 s; give 0.1 to 3600")
+        format!("{heartbeat_s} s is out of range (heartbeats are due every 0.02 s); give 0.1 to 3600")
     });
     checks.require((0.0..=3600.0).contains(&interval_s), "supervision.restart_interval_s", "out-of-range", || {
-        format!("{interval_s} s is no time between two starts; give 0 to 3600")
+        format!("{interval_s} s is out of range; give 0 to 3600")
     });
     checks.require(supervision.restarts_max <= 1000, "supervision.restarts_max", "out-of-range", || {
-        format!("{} starts of one role will not mend it; give 0 to 1000", supervision.restarts_max)
+        format!("{} restarts of one role are too many; give 0 to 1000", supervision.restarts_max)
     });
 }
 
-/// Without a rig, its roles are not known and nothing is said of them.
+/// Checks external and debugged roles. Without a rig, the roles are unknown and not checked.
 fn check_external(raw: &Raw, roles: Option<Vec<&str>>, checks: &mut Checks<'_>) {
     let Launch { external, debug, .. } = &raw.launch;
     checks.require(external.is_empty() || raw.clock != ClockKind::InProcess, "launch.external", "one-process", || {
-        "one process has no room for another's role; give clock = \"realtime\" or \"lockstep\", or leave it empty"
+        "an in-process run has no external roles; give clock = \"realtime\" or \"lockstep\", or leave it empty"
             .to_owned()
     });
     checks.require(debug.is_empty() || raw.clock != ClockKind::InProcess, "launch.debug", "one-process", || {
-        "one process has all roles: debug it, as `gdb --args corotate run …`, or give clock = \"lockstep\"".to_owned()
+        "all roles share one process: start it in a debugger, as `gdb --args corotate run …`, or give clock = \"lockstep\"".to_owned()
     });
     for (index, role) in debug.iter().enumerate().filter(|(_, role)| external.contains(role)) {
         let refused = Err(NotExternal::DebuggedAndExternal { role: role.clone() });
@@ -385,13 +385,13 @@ fn check_external(raw: &Raw, roles: Option<Vec<&str>>, checks: &mut Checks<'_>) 
     }
 }
 
-/// A process can only have roles that there are, each once, and none that is somebody else's program.
+/// Checks that every listed role exists, is listed once, and is not external.
 fn check_processes(launch: &Launch, roles: &[&str], checks: &mut Checks<'_>) {
     let mut taken = Vec::new();
     for (process, names) in launch.processes.iter().enumerate() {
         let key = format!("launch.processes[{process}]");
         checks.require(names.len() > 1, &key, "role-alone", || {
-            "a role alone has a process in any case; name two roles or more, or leave it out".to_owned()
+            "a single role always has a process of its own; name two roles or more, or remove the entry".to_owned()
         });
         for (index, name) in names.iter().enumerate() {
             let key = format!("{key}[{index}]");
@@ -399,7 +399,7 @@ fn check_processes(launch: &Launch, roles: &[&str], checks: &mut Checks<'_>) {
                 let known = roles.join(", ");
                 checks.refuse(&key, "unknown-role", format!("there is no role `{name}`; this scenario has: {known}"));
             } else if taken.contains(&name) {
-                checks.refuse(&key, "role-twice", format!("the {name} cannot be in two places; name it once"));
+                checks.refuse(&key, "role-twice", format!("the {name} is listed twice; list it once"));
             } else if launch.external.contains(name) {
                 checks.accept::<(), _>(&key, Err(NotExternal::SharedAndExternal { role: name.clone() }));
             }
@@ -408,7 +408,7 @@ fn check_processes(launch: &Launch, roles: &[&str], checks: &mut Checks<'_>) {
     }
 }
 
-/// Roles that a policy names must exist.
+/// Checks that the roles named by a policy exist.
 fn check_roles(policy: &Policy, known: &[&str], checks: &mut Checks<'_>) {
     let Policy::ByRole(roles) = policy else { return };
     for role in roles.keys().filter(|role| !known.contains(&role.as_str())) {
@@ -423,15 +423,15 @@ fn check_roles(policy: &Policy, known: &[&str], checks: &mut Checks<'_>) {
 fn check_realtime(realtime: &Realtime, checks: &mut Checks<'_>) {
     let priority = realtime.priority;
     checks.require(priority == 0 || (1..=99).contains(&priority), "realtime.priority", "out-of-range", || {
-        format!("{priority} is no SCHED_FIFO priority; give 1 to 99, or 0 not to ask for it")
+        format!("{priority} is not a SCHED_FIFO priority; give 1 to 99, or 0 to run without")
     });
     for (key, value) in [("realtime.wake_lead_us", realtime.wake_lead_us), ("realtime.spin_us", realtime.spin_us)] {
         checks.require((0.0..=100_000.0).contains(&value), key, "out-of-range", || {
-            format!("{value} us is no time to spin, which is for the last moments before a sample; give 0 to 100000")
+            format!("{value} us is out of range; give 0 to 100000")
         });
     }
     checks.require(realtime.cutoff > 0.0 && realtime.cutoff <= 1.0, "realtime.cutoff", "out-of-range", || {
-        format!("{} is no part of the period; give a number above 0, up to 1", realtime.cutoff)
+        format!("{} is not a part of the period; give a number above 0, up to 1", realtime.cutoff)
     });
     if let Cores::List(cores) = &realtime.cores {
         checks.require(

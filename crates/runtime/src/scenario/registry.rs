@@ -1,6 +1,6 @@
-//! The rigs that scenarios of this program may name.
+//! The rigs that scenarios of this program can select.
 //!
-//! Must not know more of a rig than how it is named, which tables are its own, and how it is made of them.
+//! This file knows only a rig's names, its tables, and the function that creates it.
 
 use super::any::AnyRig;
 use crate::config::{Checks, ConfigError, Document, Key, Shape, nearest};
@@ -8,7 +8,7 @@ use crate::rig::{Context, OrbitRig, Rig, RigidBodyRig};
 use std::sync::Arc;
 use std::sync::OnceLock;
 
-/// A rig that scenarios may name.
+/// A rig that scenarios can select.
 #[derive(Clone)]
 pub struct RigKind {
     names: &'static [&'static str],
@@ -17,11 +17,11 @@ pub struct RigKind {
     resolve: fn(&str, &Document, Context, &mut Checks<'_>) -> Resolved,
 }
 
-/// A rig, unless a problem with it was noted, and its tables with every default filled in.
+/// A rig and its tables with every default filled in. The rig is `None` if a problem with it was recorded.
 type Resolved = Result<(Option<Arc<dyn AnyRig>>, toml::Table), ConfigError>;
 
 impl RigKind {
-    /// That of a rig.
+    /// Creates the entry of the rig `R`.
     pub fn new<R: Rig>() -> Self {
         let resolve = |name: &str, sections: &Document, context: Context, checks: &mut Checks<'_>| {
             let (rig, table) = R::resolve(name, sections, context, checks)?;
@@ -33,36 +33,36 @@ impl RigKind {
 
 static KINDS: OnceLock<Vec<RigKind>> = OnceLock::new();
 
-/// Makes these the rigs of this program. Must come before its first scenario is read; then it is too late, and false.
+/// Sets the rigs of this program. Returns false, with no effect, if a scenario has been read before.
 pub fn register(kinds: Vec<RigKind>) -> bool {
     KINDS.set(kinds).is_ok()
 }
 
-/// The rigs of this crate, compiled with it: a program that names them so does not compile them once more.
+/// Returns the rigs of this crate. They are compiled with it, so a program that calls this function does not compile them again.
 pub fn shipped() -> Vec<RigKind> {
     vec![RigKind::new::<RigidBodyRig>(), RigKind::new::<OrbitRig>()]
 }
 
-/// The rigs of this program: those of this crate where none were registered.
+/// Returns the registered rigs, or those of this crate if none were registered.
 fn kinds() -> &'static [RigKind] {
     KINDS.get_or_init(shipped)
 }
 
-/// The keys of tables that belong to a rig, whichever it is: those that hold one table.
+/// Returns the keys of all rigs that hold one table.
 pub(crate) fn tables() -> Vec<&'static str> {
     kinds().iter().flat_map(|kind| &kind.tables).copied().collect()
 }
 
-/// The same, and those that hold a list of tables.
+/// Returns the keys of all rigs that hold a table or a list of tables.
 pub(crate) fn sections() -> Vec<&'static str> {
     tables().into_iter().chain(kinds().iter().flat_map(|kind| kind.lists).copied()).collect()
 }
 
-/// The keys of a scenario that are a rig's own, by the rig's name, as the types read them that the rig makes of them.
+/// Returns every rig name with the keys of its own, as the types that read them define.
 pub(crate) fn shapes() -> Vec<(&'static str, Vec<Key>)> {
-    let of = |kind: &RigKind, name: &'static str| {
+    let keys_of_rig = |kind: &RigKind, name: &'static str| {
         let sections = Document::asking();
-        // It is refused, having asked.
+        // The document is empty, so this fails after it has recorded what was asked for.
         let _ = (kind.resolve)(
             name,
             &sections,
@@ -75,10 +75,10 @@ pub(crate) fn shapes() -> Vec<(&'static str, Vec<Key>)> {
             _ => (name, kind.tables.iter().chain(kind.lists).map(unknown).collect()),
         }
     };
-    kinds().iter().flat_map(|kind| kind.names.iter().map(move |name| of(kind, name))).collect()
+    kinds().iter().flat_map(|kind| kind.names.iter().map(move |name| keys_of_rig(kind, name))).collect()
 }
 
-/// Resolves the rig's own sections of a scenario. The rig is absent if `checks` noted a problem with it.
+/// Resolves the tables of the rig with this name. The rig is `None` if `checks` recorded a problem with it.
 ///
 /// # Errors
 /// [`ConfigError`] for keys that are unknown, missing or of the wrong type.

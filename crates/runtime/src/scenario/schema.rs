@@ -1,6 +1,6 @@
-//! A JSON Schema of scenario files, for editors: made of the types that read them, with the comments of shipped scenarios.
+//! A JSON Schema of scenario files, for editors: built from the types that read them, with the comments of shipped scenarios.
 //!
-//! Must not promise more than it checks: what two keys say together is judged where a scenario is resolved.
+//! The schema does not cover rules between keys; these are checked when a scenario is resolved.
 
 use super::registry;
 use crate::config::raw::Raw;
@@ -8,13 +8,13 @@ use crate::config::{Key, Shape};
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 
-/// The dialect, the newest that editors of TOML know.
+/// The newest dialect that editors of TOML support.
 const DIALECT: &str = "http://json-schema.org/draft-07/schema#";
 
-/// What shipped scenarios say of their keys: by rig and path, as `leader.measured_axes`.
+/// The comments of shipped scenarios on their keys, by rig and path, as `leader.measured_axes`.
 type Notes = BTreeMap<(String, String), String>;
 
-/// The schema of the scenarios of a program, some of which it ships, by name and text.
+/// Returns the schema of a program's scenarios. `shipped` are the name and text of each scenario that it ships.
 pub fn schema(program: &str, shipped: &[(&str, &str)]) -> Value {
     let notes = notes(shipped);
     let rigs = registry::shapes();
@@ -25,15 +25,15 @@ pub fn schema(program: &str, shipped: &[(&str, &str)]) -> Value {
         properties.insert(key.name.to_owned(), of_key(key, "", &notes, None));
     }
     properties["rig"] = with_note(json!({ "enum": names }), "rig", &notes, None);
-    // Bounds of quantities and metrics that the rig tells.
+    // The rig defines the bounds of watched quantities and metrics.
     properties["watchdog"]["patternProperties"] = json!({ "_max$": { "type": "number" } });
     properties["accept"]["additionalProperties"] = json!({ "type": "number" });
-    // An editor completes from here, whichever the rig is.
+    // Editors complete keys from here, independently of the rig.
     for section in registry::sections() {
-        let of = |(name, keys): &(&str, Vec<Key>)| {
+        let section_of = |(name, keys): &(&str, Vec<Key>)| {
             keys.iter().find(|key| key.name == section).map(|key| of_key(key, "", &notes, Some(name)))
         };
-        let mut shapes: Vec<Value> = rigs.iter().filter_map(of).collect();
+        let mut shapes: Vec<Value> = rigs.iter().filter_map(section_of).collect();
         shapes.dedup();
         let shape = if shapes.len() == 1 { shapes.remove(0) } else { json!({ "anyOf": shapes }) };
         properties.insert(section.to_owned(), shape);
@@ -51,7 +51,7 @@ pub fn schema(program: &str, shipped: &[(&str, &str)]) -> Value {
     })
 }
 
-/// What holds of the rig's own sections where this rig is named.
+/// Returns the schema of a rig's own tables, which applies if the scenario selects this rig.
 fn case(name: &str, keys: &[Key], notes: &Notes) -> Value {
     let mut properties = Map::new();
     for section in registry::sections() {
@@ -100,16 +100,16 @@ fn of_shape(shape: &Shape, path: &str, notes: &Notes, rig: Option<&str>) -> Valu
     }
 }
 
-/// The schema of a value with what a shipped scenario says of its key: one of the rig, or any where the key is every rig's.
+/// Adds the comment of a shipped scenario on this key: one of the rig, or of any rig for a common key.
 fn with_note(mut value: Value, path: &str, notes: &Notes, rig: Option<&str>) -> Value {
-    let fits = |(of, at): &&(String, String)| at == path && rig.is_none_or(|rig| of == rig);
+    let fits = |(commented, at): &&(String, String)| at == path && rig.is_none_or(|rig| commented == rig);
     if let Some(note) = notes.keys().find(fits).and_then(|key| notes.get(key)) {
         value["description"] = json!(note);
     }
     value
 }
 
-/// The comments behind keys and heads of tables; of several for one key the first.
+/// Returns the comments behind keys and table heads; the first one if a key has several.
 fn notes(shipped: &[(&str, &str)]) -> Notes {
     let mut notes = Notes::new();
     for (_, text) in shipped {
@@ -141,7 +141,7 @@ mod tests {
     use crate::config::SHIPPED;
 
     #[test]
-    fn keys_come_with_what_shipped_scenarios_say_of_them() {
+    fn keys_have_the_comments_of_shipped_scenarios() {
         let schema = schema("corotate", &SHIPPED);
         assert_eq!(schema["properties"]["rig"]["enum"], json!(["rigid-body", "orbit-hold", "orbit-rendezvous"]));
         assert_eq!(schema["required"], json!(["name", "rig", "tick_hz", "duration_s"]));
@@ -151,6 +151,6 @@ mod tests {
         assert_eq!(clock, &json!(["realtime", "lockstep", "in-process"]));
         let case = &schema["allOf"][0]["then"]["properties"];
         assert_eq!(case["leader"]["properties"]["inertia_kg_m2"]["maxItems"], 3);
-        assert_eq!(case["spacecraft"], false, "another rig's");
+        assert_eq!(case["spacecraft"], false, "a table of another rig");
     }
 }
