@@ -23,13 +23,13 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// How long a role may take to end once it has been told to.
+/// The time that a role may take to end after the order to end.
 pub(super) const END_LIMIT: Duration = Duration::from_secs(5);
-/// Between two looks whether a killed process has ended.
+/// The interval between two checks whether a killed process has ended.
 const KILL_LOOK: Duration = Duration::from_micros(200);
 /// The exit code of a program of ours that failed.
 const FAILURE: i32 = 1;
-/// How much of a role's error output is kept.
+/// The part of a role's error output that is kept.
 const LAST_LINES: usize = 8;
 
 /// A role's process.
@@ -39,7 +39,7 @@ pub(super) struct RoleProcess {
     /// Readable once the process has ended; none on a kernel without.
     handle: Option<OwnedFd>,
     last_words: Arc<Mutex<VecDeque<String>>>,
-    /// Where it leaves its panic, if it does.
+    /// The file to which it writes its panic.
     panic: Option<PathBuf>,
     listener: Option<JoinHandle<()>>,
 }
@@ -74,7 +74,7 @@ impl RoleProcess {
         let stderr = child.stderr.take();
         let handle = Pid::from_raw(child.id() as i32).and_then(|pid| pidfd_open(pid, PidfdFlags::empty()).ok());
         let last_words = Arc::new(Mutex::new(VecDeque::new()));
-        // Ended again if nobody can listen to it.
+        // Ended again if its output cannot be read.
         let mut process = Self { child, status: None, handle, last_words, panic: None, listener: None };
         let listen = |stderr| listen(name.clone(), stderr, process.last_words.clone());
         process.listener = stderr.map(listen).transpose().map_err(failed)?;
@@ -93,7 +93,7 @@ impl RoleProcess {
         }
     }
 
-    /// How the process ended, if it has.
+    /// Returns the exit status of the process once it has ended.
     pub fn ended(&mut self) -> Option<ExitStatus> {
         if self.status.is_none() {
             self.status = self.child.try_wait().ok().flatten();
@@ -101,7 +101,7 @@ impl RoleProcess {
         self.status
     }
 
-    /// What there is to wait on for the end of a process that has not ended.
+    /// Returns a descriptor that becomes readable at the end of a process that still runs.
     pub fn handle(&self) -> Option<&OwnedFd> {
         self.handle.as_ref().filter(|_| self.status.is_none())
     }
@@ -111,7 +111,7 @@ impl RoleProcess {
         self.panic.as_deref().and_then(Panic::take).map(Failure::of)
     }
 
-    /// How a role failed that ended before its time.
+    /// Returns the failure of a role that ended early.
     pub fn failure(&mut self, status: ExitStatus) -> Failure {
         // A panic is caught by our own `main`, or ends the process by SIGABRT.
         let panicked = status.code() == Some(FAILURE) || status.signal() == Some(libc::SIGABRT);
@@ -140,8 +140,8 @@ impl RoleProcess {
         words.join(" | ")
     }
 
-    /// Ends the process at once and reaps it. Also one whose core somebody else keeps busy at a higher priority: it must
-    /// run to die, so it is let go to any core.
+    /// Ends the process at once and reaps it. A killed thread exits only after it has been scheduled: a process whose core
+    /// is busy at a higher priority is therefore allowed on every core.
     pub fn kill(&mut self) {
         if self.ended().is_none() {
             let mut any = CpuSet::new();

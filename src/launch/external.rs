@@ -1,4 +1,4 @@
-//! External roles that keep a run waiting: who, since when, what is missing, and what came instead.
+//! External roles that keep a run waiting: the role, the time, the missing samples, and what came instead.
 //!
 //! Must not end a run; [`super::processes`] does. Must not blame a role whose own inputs are missing.
 
@@ -17,10 +17,10 @@ const WORD_INTERVAL_NS: u64 = 60_000_000_000;
 const TICKS_LIMIT_S: f64 = 30.0;
 /// The least limit in real time, periods.
 const LIMIT_PERIODS: f64 = 10.0;
-/// The most that one look adds to a wait, ns: a launcher that was stopped blames nobody.
+/// The most that one check adds to a wait, ns: a launcher that was stopped must not blame a role.
 const LOOK_MAX_NS: u64 = 100_000_000;
 
-/// How long each role of a run has been waited for.
+/// The time for which each role of a run has been waited for.
 pub(super) struct ExternalWatch {
     waits: Vec<Wait>,
 }
@@ -43,7 +43,7 @@ struct Wait {
 }
 
 impl Wait {
-    /// Goes on waiting for the same, or begins anew; how long it has lasted, ns.
+    /// Continues the wait for the same samples, or begins a new one; returns its duration, ns.
     fn look(&mut self, lack: Lack, now_ns: u64) -> u64 {
         if self.lack.as_ref().is_some_and(|before| before.is_still(&lack)) {
             self.waited_ns += now_ns.saturating_sub(self.looked_ns).min(LOOK_MAX_NS);
@@ -54,7 +54,7 @@ impl Wait {
         self.waited_ns
     }
 
-    /// Whether it is time to name the role again.
+    /// Returns true if it is time to name the role again.
     fn word_due(&mut self) -> bool {
         let due = self.waited_ns >= self.next_word_ns;
         if due {
@@ -108,7 +108,7 @@ impl ExternalWatch {
         self.look(members, limit_s, lack, now_ns)
     }
 
-    /// Whether some role is waited for at the last look.
+    /// Returns true if the last check waited for a role.
     pub fn waits(&self) -> bool {
         self.waits.iter().any(|wait| wait.lack.is_some())
     }
@@ -161,7 +161,7 @@ mod tests {
         assert!(!wait.word_due());
     }
 
-    /// Whoever stopped the launcher did not stop the role.
+    /// A stop of the launcher is not a stop of the role.
     #[test]
     fn time_in_which_nobody_looked_does_not_count() {
         let mut wait = Wait::default();

@@ -1,9 +1,9 @@
 //! The janitor: a process that puts away what dead processes left in a run's domain, and removes the domain if the launcher
 //! is killed.
 //!
-//! The transport's clean-up may take long, and for ever where a maker stands still, so nobody waits for it: the launcher
-//! asks by a byte, looks for the answer when it comes by, and replaces a janitor that does not answer in time. Must not
-//! touch what belongs to the living.
+//! The transport's clean-up may take long, and never ends while a file's maker is stopped. So the launcher does not wait: it
+//! asks by a byte, polls for the answer, and replaces a janitor that does not answer in time. Must not
+//! touch what belongs to live processes.
 
 use super::LaunchError;
 use crate::bus::domain::{self, Domain};
@@ -22,11 +22,11 @@ use std::time::{Duration, SystemTime};
 
 /// The launcher asks for what the dead left to be put away; so is answered when it is done.
 const CLEAR: u8 = b'c';
-/// A janitor that has not answered for so long is replaced, ns. A clean-up takes some 5 ms per dead process.
+/// The time without an answer after which a janitor is replaced, ns. A clean-up takes some 5 ms per dead process.
 const ANSWER_NS: u64 = 2_000_000_000;
-/// So many janitors in a row are tried for one request.
+/// The number of janitors that are tried in a row for one request.
 const ATTEMPTS: u32 = 3;
-/// Between two looks for unfinished files and for processes that came.
+/// The interval between two checks for unfinished files and new processes.
 const LOOK: Duration = Duration::from_millis(50);
 /// A directory's time of change is so coarse at the most: what changed just before a look is looked at again.
 const GRAIN: Duration = Duration::from_millis(100);
@@ -69,12 +69,12 @@ impl Janitor {
         if self.pending == 0 {
             (self.since_ns, self.attempts) = (monotonic_ns(), 1);
         }
-        // A janitor that died, or whose line is full because it stands still, is found by the look for its answer.
+        // If the janitor died, or is stopped and its pipe full, the check for its answer finds that.
         let _ = self.process.line.write_all(&[CLEAR]);
         self.pending += 1;
     }
 
-    /// Whether what was asked for is not done. To be asked again and again: it is here that answers are looked for.
+    /// Returns true while a request is unanswered. To be called repeatedly: it reads the answers.
     pub fn is_busy(&mut self) -> bool {
         if self.pending == 0 {
             return false;
@@ -96,7 +96,7 @@ impl Janitor {
         self.pending > 0
     }
 
-    /// What there is to wait on for an answer, if one is due.
+    /// Returns the descriptor on which to wait for an answer, if one is due.
     pub fn answers(&self) -> Option<BorrowedFd<'_>> {
         (self.pending > 0).then(|| self.process.answers.as_fd())
     }
@@ -141,7 +141,7 @@ impl Process {
     }
 }
 
-/// The domain is gone. It is ended, not asked to end: it may stand still, and nobody waits for it.
+/// The domain is gone. The janitor is killed, not asked to end: it may be stopped, and the launcher does not wait for it.
 impl Drop for Janitor {
     fn drop(&mut self) {
         self.process.kill();
@@ -153,7 +153,7 @@ fn timespec(duration: Duration) -> Timespec {
 }
 
 /// The janitor's work in a domain: removes unfinished files, puts away what the dead left when `line` asks for it or
-/// somebody comes, and answers. At the end of `line` the launcher is dead: removes what is left of this domain and of every other
+/// a process joins, and answers. At the end of `line` the launcher is dead: removes what is left of this domain and of every other
 /// whose launcher is dead.
 ///
 /// # Errors
@@ -169,7 +169,7 @@ pub fn janitor(
     std::thread::Builder::new().spawn(move || sweep(&swept, limit))?;
     let mut nodes = Watched::new(domain.root().join("nodes"));
     loop {
-        // What cannot be put away now is so when somebody comes again.
+        // What cannot be removed now is removed when the next process joins.
         let clear = || drop(iox::clear_dead(domain));
         if nodes.changed() {
             clear();
@@ -184,7 +184,7 @@ pub fn janitor(
             Ok(count) => &requests[..count],
         };
         clear();
-        // Nobody is left to be told if this fails.
+        // No process is left to which a failure could be reported.
         let _ = answers.write_all(requests).and_then(|()| answers.flush());
     }
     // Roles whose launcher was killed are dying at this moment: what they still hold, or were just about to make, goes in a
@@ -215,7 +215,7 @@ fn sweep(domain: &Domain, limit: Duration) {
 /// A directory in which files come and go.
 struct Watched {
     path: PathBuf,
-    /// When it had changed last, as it was seen last.
+    /// The time of its latest change that was seen.
     seen: Option<SystemTime>,
 }
 
@@ -224,11 +224,11 @@ impl Watched {
         Self { path, seen: None }
     }
 
-    /// Whether a file may have come or gone since the last look.
+    /// Returns true if a file may have come or gone since the last check.
     fn changed(&mut self) -> bool {
         let now = SystemTime::now();
         let Ok(changed) = fs::metadata(&self.path).as_ref().map(Metadata::modified) else { return false };
-        // A system that does not tell is looked at every time.
+        // Without a time of change, the directory is read every time.
         let changed = changed.ok().filter(|changed| now.duration_since(*changed).is_ok_and(|age| age > GRAIN));
         changed.is_none() || std::mem::replace(&mut self.seen, changed) != changed
     }

@@ -1,5 +1,5 @@
-//! The part of a host that joined a run: starts its roles, supervises them, and ends them when the run ends, or when nothing is heard
-//! of it any more.
+//! The part of a host that joined a run: starts its roles, supervises them, and ends them when the run ends or its heartbeats
+//! stop.
 //!
 //! Leads nothing: phases, epoch and credit are the word of the host that launched. Must not score, nor record.
 
@@ -27,13 +27,13 @@ const LOOK_NS: u64 = 10_000_000;
 /// Between two looks at the word when there is none, ns: in real time, and in lockstep.
 const LULL_NS: u64 = 1_000_000;
 const LOCKSTEP_LULL_NS: u64 = 50_000;
-/// How long the relay may take to tell how the host ended, ns: longer than it tries.
+/// The time that the relay may take to report the host's end, ns: longer than it tries.
 const TELL_NS: u64 = 25_000_000_000;
 
-/// How a host's part in a run ended.
+/// The end of a host's part in a run.
 #[derive(Debug)]
 pub struct FarOutcome {
-    /// Why the host gave up, if it did.
+    /// The reason for which the host gave up, if it did.
     pub failed: Option<String>,
     /// Roles that failed there.
     pub incidents: Vec<Incident>,
@@ -57,7 +57,7 @@ pub fn join(
     prepare(scenario, launch, domain)?;
     let path = clock_path(domain);
     let failed = |source| LaunchError::Write { path: path.clone(), source };
-    // Made here, so that every process of this host finds it, before it says anything.
+    // Made here, so that every process of this host finds it before it publishes anything.
     RunClock::open(&path).map_err(failed)?;
     let startup_limit = Duration::from_secs_f64(scenario.startup_timeout_s);
     let mut janitor = super::janitor::Janitor::start(domain, startup_limit)?;
@@ -86,7 +86,7 @@ pub fn join(
     Ok(FarOutcome { failed: far_end.failed, incidents: far_end.incidents, ticks })
 }
 
-/// Ends the roles, and leaves for the relay what they and this process have to tell.
+/// Ends the roles, and leaves their final reports and that of this process for the relay.
 fn end(
     mut supervisor: Supervisor<'_>,
     failed: Option<String>,
@@ -139,7 +139,7 @@ impl Follower<'_> {
         Ok(news)
     }
 
-    /// Goes on until the run ends; why this host gave up, if it did.
+    /// Supervises until the run ends; returns the reason if this host gave up.
     fn follow(
         mut self,
         supervisor: &mut Supervisor<'_>,
@@ -160,7 +160,7 @@ impl Follower<'_> {
                 if signal != 0 {
                     return Ok(Some(format!("it was ended by signal {signal}")));
                 }
-                // Whoever stopped this process did not silence the other host.
+                // A stop of this process is not a silence of the other host.
                 let looked_ns = raw_ns();
                 if looked_ns - std::mem::replace(&mut told_ns, looked_ns) > 20 * LOOK_NS {
                     self.heard_ns = looked_ns;

@@ -1,7 +1,7 @@
-//! The recorder of a run, seen from the launcher: started beside the roles, or by somebody else while they run.
+//! The launcher's view of the recorder of a run: started beside the roles, or by the user while they run.
 //!
-//! In lockstep nobody gets ahead of it by more than the window, as of the scorer. Must not let a recorder that died, or says
-//! nothing any more, hold the run up.
+//! In lockstep no role gets ahead of it, or of the scorer, by more than the window. Must not let a recorder that died, or is
+//! silent, hold the run up.
 
 use super::LaunchError;
 use super::companion::Companion;
@@ -20,7 +20,7 @@ use crate::telemetry::RoleReport;
 use std::path::Path;
 use std::process::Command;
 
-/// The most that one look adds to its silence, ns: a launcher that stood still blames nobody.
+/// The most that one check adds to its silence, ns: a launcher that was stopped must not blame the recorder.
 const LOOK_MAX_NS: u64 = 100_000_000;
 
 /// A run's recorder, if it has one.
@@ -39,7 +39,7 @@ pub(super) struct RecorderWatch {
 }
 
 impl RecorderWatch {
-    /// Starts a recorder to `file`; without one, looks out for somebody else's.
+    /// Starts a recorder to `file`; without a file, watches for one that the user starts.
     pub fn start(file: Option<&Path>, scenario: &Scenario, domain: &Domain, bus: &IoxBus) -> Result<Self, LaunchError> {
         let arguments = file.map(|file| {
             move |command: &mut Command| {
@@ -59,7 +59,7 @@ impl RecorderWatch {
         })
     }
 
-    /// Hears how it is.
+    /// Reads the recorder's status.
     pub fn listen(&mut self) -> Result<(), BusError> {
         let now_ns = monotonic_ns();
         self.silent_ns += now_ns.saturating_sub(self.looked_ns).min(LOOK_MAX_NS);
@@ -72,14 +72,14 @@ impl RecorderWatch {
         Ok(())
     }
 
-    /// Whether it has come to a state before the ticks; how it failed if it never will.
+    /// Returns true once it has reached a state before the ticks, or its failure.
     pub fn has_reached(&mut self, state: RoleState) -> Result<bool, LaunchError> {
         let (name, Some(process)) = self.companion.process() else { return Ok(true) };
         process.require_alive(name)?;
         Ok(self.state() >= state)
     }
 
-    /// The last tick that has been seen by whoever must see every one, if it is `scored` without the recorder and the last
+    /// Returns the last tick that every required reader has seen, if it is `scored` without the recorder and the last
     /// credit was `given`. One that joined late gets nothing from a writer that waits: there is credit for one tick more, of
     /// which it gets everything.
     pub fn credit(&mut self, scored: u64, given: u64) -> Result<u64, BusError> {
@@ -103,14 +103,14 @@ impl RecorderWatch {
         self.problem = self.companion.loss(silent, janitor);
     }
 
-    /// Whether it still writes: a process of ours has not ended, or somebody else's has not said that it is done.
+    /// Returns true while it writes: our process has not ended, or a recorder of the user has not reported its end.
     pub fn lingers(&mut self) -> bool {
         // Nothing is lost but its last words if the link has failed.
         let _ = self.listen();
         self.companion.lingers() || self.file.is_none() && self.active()
     }
 
-    /// Tells what is in the file, beside the roles' final counters. A recorder that has not ended by now is ended.
+    /// Returns the contents of the file, beside the roles' final counters. A recorder that still runs is ended.
     pub fn finish(
         mut self,
         domain: &Domain,
@@ -142,7 +142,7 @@ impl RecorderWatch {
         Some(report)
     }
 
-    /// Whether there is one that takes samples, or is about to: from its first word on.
+    /// Returns true if a recorder takes samples or is about to: from its first status on.
     fn active(&self) -> bool {
         let records = (RoleState::Ready..RoleState::Done).contains(&self.state());
         records && self.problem.is_none() && self.health.has_writer()

@@ -1,4 +1,4 @@
-//! The relay of a run over several hosts, seen from the launcher: started beside the roles, and what other hosts have told.
+//! The launcher's view of the relay of a run over several hosts: its process, and the reports of the other hosts.
 //!
 //! Must not carry anything, nor decide when a run ends; [`super::processes`] does.
 
@@ -14,10 +14,10 @@ use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::process::Command;
 
-/// What the launcher of a host that joined leaves for the one of the run.
+/// The final account of a joined host's launcher for the launcher of the run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct FarEnd {
-    /// Why the host gave up, if it did.
+    /// The reason for which the host gave up, if it did.
     pub failed: Option<String>,
     /// Roles that failed there, as incidents.
     pub incidents: Vec<Incident>,
@@ -31,7 +31,7 @@ pub(super) struct RelayWatch {
     root: PathBuf,
     /// All hosts, and whether it is known how each of the others ended.
     hosts: Vec<(String, bool)>,
-    /// Whether this is the host that launched.
+    /// True on the host that launched.
     leads: bool,
 }
 
@@ -53,23 +53,23 @@ impl RelayWatch {
         Ok(Self {
             companion: Companion::start(RELAY, arguments)?,
             root: domain.root().to_owned(),
-            // Only the host that launched is told of others.
+            // Only the host that launched receives reports of other hosts.
             hosts: if seat.is_some_and(|seat| seat.host == hub) { hosts.collect() } else { Vec::new() },
             leads: seat.is_some_and(|seat| seat.host == hub),
         })
     }
 
-    /// Whether this is the host that launched: its relay ends with the run, that of another once it has told how the host ended.
+    /// Returns true on the host that launched: its relay ends with the run. Any other relay ends after it has reported its host's end.
     pub fn leads(&self) -> bool {
         self.leads
     }
 
-    /// Whether it carries; how it failed if it never will.
+    /// Returns true once it carries samples, or its failure.
     pub fn ready(&mut self) -> Result<bool, LaunchError> {
         self.companion.ready(&ready_path(&self.root))
     }
 
-    /// What ends the run: the relay has failed, or a host has ended while ticks were to run. `tick` is the one at hand.
+    /// Returns the incident that ends the run: the relay failed, or a host ended while ticks were to run. `tick` is the current one.
     pub fn supervise(&mut self, scenario: &Scenario, tick: u64) -> Vec<Incident> {
         let mut incidents = Vec::new();
         if let Some(failure) = self.companion.failure() {
@@ -95,7 +95,7 @@ impl RelayWatch {
         incidents
     }
 
-    /// What the hosts tell at the end: their accounts, what went wrong there, and incidents that are not in `known`.
+    /// Returns the hosts' final reports: accounts, errors, and incidents that are not in `known`.
     pub fn finish(&mut self, known: &Incidents) -> (Vec<HostReport>, Vec<String>, Vec<Incident>) {
         self.companion.process().1.map(RoleProcess::kill);
         let (mut reports, mut problems, mut incidents) = (Vec::new(), Vec::new(), Vec::new());

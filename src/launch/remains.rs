@@ -1,12 +1,12 @@
-//! What is still there of a run whose roles have ended.
+//! The resources of a run that outlive its roles.
 
 use super::janitor::Janitor;
 use crate::bus::domain::OwnedDomain;
 use crate::bus::iox::IoxBus;
 use std::fmt;
 
-/// What is still there of a run whose roles have ended. It is removed when this is dropped, in this order: after the
-/// results have been written and told.
+/// The resources of a run that outlive its roles. They are removed in this order when this is dropped: after the
+/// results have been written and printed.
 pub(super) struct Remains {
     _bus: IoxBus,
     _domain: OwnedDomain,

@@ -1,6 +1,6 @@
 //! A recorded role replayed as a process: the very program that takes part in runs, in a domain of its own, fed in lockstep.
 //!
-//! One role at a time. Must not judge: [`crate::record`] says what the role gets and compares what it says.
+//! One role at a time. Must not judge: [`crate::record`] selects the role's inputs and compares its outputs.
 
 use super::LaunchError;
 use super::children::{END_LIMIT, RoleProcess};
@@ -19,7 +19,7 @@ use std::time::Duration;
 
 /// Between two looks when nothing has come for a while, ns.
 const LULL_NS: u64 = 50_000;
-/// Without any progress for so long the role counts as hung, ns.
+/// The time without progress after which the role counts as hung, ns.
 const HUNG_NS: u64 = 30_000_000_000;
 
 /// Replays a role of a recording as a process. `scenario` is the recording's with the clock `lockstep`; `signal` ends it.
@@ -61,7 +61,7 @@ pub fn replay_as_process(
     Ok(prompter.comparer.finish(&script, &script.steps, script.limit.clone()))
 }
 
-/// What one process cannot do again is left out, and said.
+/// Leaves out, with a note, what a single process cannot repeat.
 fn cut(script: &mut Script, scenario: &Scenario) {
     let plant = matches!(script.role, RoleId::Plant(_));
     // What a scripted fault took from it, that takes from it again.
@@ -112,7 +112,7 @@ struct Prompter<'a> {
     script: &'a Script,
     moved_ns: u64,
     next_word_ns: u64,
-    /// How far the feeding runs ahead of what comes back.
+    /// The lead of the inputs over the outputs.
     ahead_ticks: u64,
 }
 
@@ -168,7 +168,7 @@ impl Prompter<'_> {
         }
     }
 
-    /// False if a signal says so.
+    /// Returns false if a signal ended the replay.
     fn goes_on(&mut self) -> Result<bool, LaunchError> {
         if let Some(status) = self.process.ended() {
             let failure = self.process.failure(status);

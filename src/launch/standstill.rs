@@ -53,7 +53,7 @@ pub(super) fn standstill(pid: i32) -> Option<Standstill> {
     (stopped || debugger.is_some()).then_some(Standstill { stopped, debugger })
 }
 
-/// Returns true if a process has ended and nobody has reaped it yet: a debugger that traced it may keep it so for ever.
+/// Returns true if a process has ended and is not reaped yet: a debugger that traced it may keep it so for ever.
 pub(super) fn is_zombie(pid: i32) -> bool {
     let threads = threads(pid);
     !threads.is_empty() && threads.iter().all(|thread| thread.dead())

@@ -40,7 +40,7 @@ impl<'a> Supervisor<'a> {
         new
     }
 
-    /// Where the run stands.
+    /// Returns the phase of the run.
     pub fn phase(&self) -> Phase {
         Phase::from_number(self.word.phase)
     }
@@ -58,7 +58,7 @@ impl<'a> Supervisor<'a> {
         Progress::Waiting { roles, external: Vec::new(), hosts: Vec::new(), domain: self.domain.root().to_owned() }
     }
 
-    /// What happened, and the relay, once all roles have ended.
+    /// Returns the incidents and the relay once all roles have ended.
     pub fn dismiss(self) -> (Vec<Incident>, RelayWatch) {
         (self.incidents.finish(&BTreeMap::new()), self.relay)
     }
