@@ -149,7 +149,7 @@ fn describe_seats(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain) -> 
     Ok(())
 }
 
-/// What the roles left when they went.
+/// The final reports of the roles.
 #[derive(Default)]
 pub(super) struct ShutdownReport {
     pub reports: Vec<RoleReport>,
@@ -608,7 +608,7 @@ impl<'a> Supervisor<'a> {
     }
 }
 
-/// Why a link failed, if a process died: one that dies while it opens its links leaves some half made.
+/// The cause of a link's failure, if a process died: one that dies while it opens its links leaves some half made.
 fn blame<'a>(
     error: LaunchError,
     processes: impl Iterator<Item = (&'a str, Option<&'a mut RoleProcess>)>,

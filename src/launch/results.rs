@@ -39,10 +39,10 @@ const RECORDING_HEAD: u64 = 64;
 const RECORDING_PROFILE: &[u8] = b"\x04\0\0\0ros2";
 const RECORDING_LIBRARY: &[u8] = b"corotate ";
 
-/// Whether a file's content is an older run's.
+/// True if a file's content is an older run's.
 type IsOurs = fn(&[u8]) -> bool;
 
-/// Why a directory cannot take a run's results.
+/// The reason for which a directory cannot take a run's results.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum ResultsError {
@@ -92,7 +92,7 @@ pub enum ResultsError {
     },
 }
 
-/// Where runs go that are not told where.
+/// The default directory of runs.
 pub const RUNS: &str = "runs";
 /// The link in it to the newest.
 pub const LATEST: &str = "latest";
@@ -202,7 +202,7 @@ fn lock(directory: &Path, run: RunId) -> Result<File, ResultsError> {
         let opened = files::open_with(&path, options.read(true).write(true).create(true), OFlags::NOFOLLOW);
         let mut file = opened.map_err(failed)?;
         let mut text = String::new();
-        // Text that is no text is not ours either.
+        // A file that is not valid text is not ours either.
         let read = (&file).take(LOCK_TEXT).read_to_string(&mut text);
         if read.is_err() || !(text.is_empty() || text.starts_with(LOCK_HEAD)) {
             return Err(ResultsError::Foreign { path });

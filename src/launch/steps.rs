@@ -57,7 +57,7 @@ pub struct Steps {
     _bus: MemoryBus,
 }
 
-/// The state of a body at the tick at hand, which no controller sees.
+/// The state of a body at the current tick, which no controller sees.
 #[derive(Debug, Clone, Default)]
 pub struct BodyState {
     /// Its name.
@@ -185,7 +185,7 @@ impl Steps {
         Ok(true)
     }
 
-    /// The state of every body at the tick at hand.
+    /// The state of every body at the current tick.
     pub fn bodies(&self) -> impl Iterator<Item = &BodyState> {
         self.truths.iter().map(|truth| &truth.state)
     }
@@ -200,7 +200,7 @@ impl Steps {
         &self.outputs
     }
 
-    /// The tick at hand.
+    /// The current tick.
     pub fn tick(&self) -> u64 {
         self.tick
     }

@@ -197,7 +197,7 @@ impl Member {
         Ok(())
     }
 
-    /// Where the role stands, as far as it has said.
+    /// Returns the last state that the role reported.
     pub fn state(&self) -> RoleState {
         RoleState::from_number(self.last.state)
     }
@@ -345,7 +345,7 @@ impl Member {
         self.external && self.host.is_none()
     }
 
-    /// Whether and how the role has failed: its process has ended, or it has been silent for too long.
+    /// Returns the failure of the role, if any: its process has ended, or it has been silent for too long.
     pub fn failure(&mut self, scenario: &Scenario, janitor: &mut Janitor) -> Option<Failure> {
         if self.external {
             return self.fell_silent(scenario, janitor);
@@ -456,7 +456,7 @@ impl Member {
         }
     }
 
-    /// Whether its process has ended and nothing is missing: every tick is done, and every report is there.
+    /// Returns true if its process has ended and nothing is missing: every tick is done, and every report is there.
     pub fn ended_complete(&mut self, scenario: &Scenario, domain: &Domain) -> bool {
         let ended = self.process.as_mut().is_some_and(|process| process.ended().is_some());
         ended
@@ -498,7 +498,7 @@ impl Member {
         let action = if again { Action::Restarted } else { Action::Stopped };
         self.lost = !again;
         let incident = Incident { begins_anew, repeated, ..self.incident(failure, scenario, action) };
-        // Reaped here, before anybody takes the seat.
+        // Reaped here, before another process takes the seat.
         self.process = None;
         if again {
             self.restarts += 1;
@@ -531,7 +531,7 @@ impl Member {
         }
     }
 
-    /// How long the role was out, ns: told once, as soon as its successor runs.
+    /// Returns the outage of the role, ns, once, as soon as its successor runs.
     pub fn back_after_ns(&mut self, now_ns: u64) -> Option<u64> {
         let (_, noticed_ns) = self.restart.filter(|_| self.state() >= RoleState::Running)?;
         self.restart = None;
