@@ -13,6 +13,8 @@ use std::fmt::Write;
 
 /// Rows of results that are shown unless all are asked for: with the rest they fit on a screen of 24 lines.
 const RESULT_ROWS: usize = 8;
+/// The end of a serial line's words if nothing went wrong on it.
+const NO_FAULT: &str = "; no fault";
 /// Incidents that are shown unless all are asked for.
 const INCIDENTS: usize = 4;
 
@@ -51,10 +53,11 @@ pub fn table(summary: &Summary, all: bool) -> String {
     }
     counters(summary, all, &mut text);
     watchdog(summary, all, &mut text);
+    let lines = summary.lines.iter().map(|(body, counters)| line_words(body, counters));
+    for line in lines.filter(|line| all || !line.ends_with(NO_FAULT)) {
+        let _ = writeln!(text, "{line}");
+    }
     if all {
-        for (body, counters) in &summary.lines {
-            let _ = writeln!(text, "{}", line_words(body, counters));
-        }
         summary.hosts.iter().for_each(|summary| hosts(summary, &mut text));
     }
     privileges(summary, all, &mut text);
@@ -91,7 +94,7 @@ pub fn line_words(body: &str, counters: &LineCounters) -> String {
     ];
     let ill: Vec<String> =
         ill.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}")).collect();
-    if ill.is_empty() { format!("{well}; no fault") } else { format!("{well}\n  {}", ill.join(", ")) }
+    if ill.is_empty() { format!("{well}{NO_FAULT}") } else { format!("{well}\n  {}", ill.join(", ")) }
 }
 
 fn results(summary: &Summary, all: bool, text: &mut String) {

@@ -213,7 +213,7 @@ fn a_log_of_ones_own_leads_and_what_it_cannot_is_refused_with_its_place() {
         (&["--set=leader.playback.rates=['a','b','c']"], format!("bench/own.toml:{data}: leader.data: ")),
         (&["--set=leader.initial_rate_rad_s=[1,2,3]"], "remove one of them".to_owned()),
         (&["--set=leader.playback.at_ned=repeat"], "did you mean `at_end`?".to_owned()),
-        (&["--set=leader.playback.hash='0'"], "is not what it was".to_owned()),
+        (&["--set=leader.playback.hash='0'"], "[log-changed]".to_owned()),
     ] {
         let more = if more.len() == 1 { [&segment[..], &["--duration=0.5"], more].concat() } else { more.to_vec() };
         let refused = with(&more);

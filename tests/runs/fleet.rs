@@ -201,7 +201,7 @@ fn what_no_fleet_can_be_is_refused_with_its_reason() {
         ("follower.0.count=-1", "one process cannot host -1 bodies"),
         ("follower.0.count=1000000000", "one process cannot host 1000000000 bodies"),
         ("follower.0.count=2.5", "give a whole number"),
-        ("follower.0.initial_rate_spread_rad_s=[0.1, -0.1, 0.1]", "below zero; give 0 or more"),
+        ("follower.0.initial_rate_spread_rad_s=[0.1, -0.1, 0.1]", "[negative]"),
         ("follower.0.initial_rate_spread_rad_s=[4000.0, 0.0, 0.0]", "it turns too far from one tick"),
         ("follower.0.noise_rad_s=[1e-3, 0.0, 0.0]", "is not supported for a fleet"),
         ("follower.0.bias_rad_s=[1e-3, 0.0, 0.0]", "is not supported for a fleet"),

@@ -580,8 +580,6 @@ fn what_a_partner_without_books_sends_is_counted_where_it_is_read() {
     assert_eq!(summary["books"]["rejected_by"], link["rejected_by"]);
     assert_eq!(summary["books"]["balanced"], true);
     assert_eq!(summary["state"]["first_disturbed_tick"], BAD_TICK);
-    let told = "corotate/hil-pair/follower/measurement at controller: 60 rejected (59 not finite, 1 stamp), 0 stale, 0 void of 101 received";
-    assert!(done.stderr.contains(told), "{done:?}");
     let verdict = std::fs::read_to_string(bench.path("verdict.xml")).unwrap();
     for name in ["rejected_samples", "rejected_samples of corotate/hil-pair/follower/measurement at controller"] {
         assert!(verdict.contains(&format!("<property name=\"{name}\" value=\"60\"/>")), "{verdict}");

@@ -243,7 +243,7 @@ fn every_shipped_scenario_has_a_report() {
         check_page(&html);
         let page = parse(&html);
         assert!(section(&page, "motion").descendants().any(|node| node.has_tag_name("figure")), "{scenario}");
-        assert!(text(section(&page, "events")).ends_with("all roles together: 0.\n"), "{scenario}");
+        assert!(text(section(&page, "events")).ends_with("all roles: 0.\n"), "{scenario}");
     }
 }
 

@@ -239,7 +239,7 @@ fn a_watcher_that_waits_for_a_run_ends_when_it_is_told() {
     bench.await_role("controller");
     // A run without its scenario has only just begun, so there is something to wait for.
     let (there, aside) = (domain.join("scenario.toml"), domain.join("aside"));
-    std::fs::rename(&there, &aside).unwrap();
+    await_some(|| std::fs::rename(&there, &aside).ok());
     let watcher = bench.start(&["watch", domain.to_str().unwrap(), "--once", "1"]);
     await_some(|| common::catches(watcher.pid(), 15).then_some(()));
     let told = Instant::now();

@@ -16,6 +16,6 @@ fn hashes(clock: &str) -> Vec<String> {
 
 #[test]
 fn in_one_thread_and_as_processes() {
-    let one = hashes("in-process");
-    assert!(one.len() > 1 && one == hashes("lockstep"));
+    let in_process = hashes("in-process");
+    assert!(in_process.len() > 1 && in_process == hashes("lockstep"));
 }
