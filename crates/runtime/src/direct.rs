@@ -1,8 +1,8 @@
-//! A run in one thread, as short as it can be: the roles are called one after the other on samples that stay in place.
+//! Runs a scenario in one thread: calls the roles one after the other, on samples that stay in place.
 //!
-//! It holds as long as every sample is there and is believed, which makes all counters known. At the first that is not, the
-//! run is begun anew by the nodes, which know what to do then: the same bits up to there, by the same roles. Must not do
-//! anything that a node would not have done, nor go on where one would have had a choice.
+//! This is valid while every sample is present and accepted, because all counters are then known. At the first sample that is
+//! not, the run starts again with the nodes, which handle that case; the same roles give the same bits up to there. Must not do
+//! anything that a node would not have done, nor continue where a node would have had a choice.
 
 use crate::bus::Signal;
 use crate::clock::Grid;
@@ -17,10 +17,10 @@ use crate::telemetry::{Checkpoints, Ledger, LinkRead, LinkWritten, RoleReport, S
 use std::hint::black_box;
 use std::time::Instant;
 
-/// Ticks between two looks at signals and progress.
+/// Ticks between two checks of signals and two progress reports.
 pub const TURN_TICKS: u64 = 1024;
 
-/// One body with what it sends, and what the controller makes of that.
+/// A body, its latest samples, and the controller that drives it, if any.
 struct Driven<R: Rig> {
     plant: Plant<R::Body>,
     measurement: Measurement<R>,
@@ -29,12 +29,12 @@ struct Driven<R: Rig> {
     hashes: [StateHash; 2],
 }
 
-/// A body's law with its command and the guards on the way.
+/// A body's control law with its commands and the guards of both readers.
 struct Controlled<R: Rig> {
     controller: Controller<R::Law>,
     measurement_guard: R::MeasurementGuard,
     command_guard: R::CommandGuard,
-    /// Those on their way, by their tick modulo the delay.
+    /// The commands in flight, indexed by their tick modulo the delay.
     commands: Vec<Command<R>>,
     hash: StateHash,
 }
@@ -46,8 +46,8 @@ fn is_plain(scenario: &Settings) -> bool {
     single && scenario.faults.is_empty() && scenario.watch.max == watch.max
 }
 
-/// Runs a scenario that nobody records; none if it has to be run by the nodes. `proceed` is told every [`TURN_TICKS`] ticks which
-/// one was executed, with the latest value of the first metric; the run ends if it returns false.
+/// Runs a scenario without a recording. Returns `None` if the nodes must run it. Every [`TURN_TICKS`] ticks it calls `proceed`
+/// with the last tick and the latest value of the first metric; the run ends if that returns false.
 pub(crate) fn run_rig<R: Rig>(
     rig: &R,
     scenario: &Settings,
@@ -57,8 +57,8 @@ pub(crate) fn run_rig<R: Rig>(
     is_plain(scenario).then(|| Run::new(rig, scenario, checkpoints).run(proceed)).flatten()
 }
 
-/// Where the command of a tick lies, and where that lay which is applied then. As a rule without a division.
-fn place(tick: u64, delay_ticks: u64) -> usize {
+/// Returns the index of a tick's command, which is also that of the command applied at this tick. Usually needs no division.
+fn command_index(tick: u64, delay_ticks: u64) -> usize {
     if delay_ticks == 1 { 0 } else { (tick % delay_ticks) as usize }
 }
 
@@ -70,7 +70,7 @@ struct Run<'a, R: Rig> {
     measurement_guard: R::MeasurementGuard,
     estimate: Estimate<R>,
     estimate_hash: StateHash,
-    /// The controller's and the scorer's: both judge the same samples.
+    /// One guard for controller and scorer: both judge the same samples.
     estimate_guard: R::EstimateGuard,
     scoring: Scoring<R>,
 }
@@ -124,7 +124,7 @@ impl<'a, R: Rig> Run<'a, R> {
         Some((reports, score))
     }
 
-    /// One tick through all roles; false if one of them has a choice.
+    /// Runs one tick of all roles. Returns false if a node would have had a choice.
     #[inline]
     fn tick(&mut self, tick: u64) -> bool {
         let stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
@@ -132,9 +132,9 @@ impl<'a, R: Rig> Run<'a, R> {
         for body in &mut self.bodies {
             let applied = match &mut body.command {
                 Some(controlled) if tick > 0 => {
-                    let (came, due) = (place(tick - 1, delay), place(tick, delay));
+                    let (newest, due) = (command_index(tick - 1, delay), command_index(tick, delay));
                     let expected = if tick < delay { CommandEvent::NotDue } else { CommandEvent::Applied };
-                    controlled.command_guard.accepts(&controlled.commands[came])
+                    controlled.command_guard.accepts(&controlled.commands[newest])
                         && body.plant.command(tick, Some(&controlled.commands[due])) == expected
                 }
                 _ => body.plant.command(tick, None) == CommandEvent::NotDue,
@@ -165,7 +165,7 @@ impl<'a, R: Rig> Run<'a, R> {
             if !controlled.measurement_guard.accepts(measurement) {
                 return false;
             }
-            let command = &mut controlled.commands[place(tick, delay)];
+            let command = &mut controlled.commands[command_index(tick, delay)];
             controlled.controller.step(&self.estimate, measurement, command);
             let stamp = command.stamp_mut();
             (stamp.generation, stamp.sent_ns) = (1, 0);
@@ -176,7 +176,7 @@ impl<'a, R: Rig> Run<'a, R> {
         true
     }
 
-    /// The account of a role that executed every tick on every input.
+    /// Returns the report of a role that executed every tick on every input.
     fn report(&self, role: RoleId, ticks: u64) -> RoleReport {
         let ports = ports(self.scenario, role);
         let written = ports.writes.iter().map(|port| LinkWritten {
@@ -190,7 +190,7 @@ impl<'a, R: Rig> Run<'a, R> {
             hash: Some(self.checkpoints(&port.topic.body, port.topic.signal)),
         });
         let read = ports.reads.iter().map(|port| {
-            // The last command waits for a tick that does not come.
+            // The last command is due after the last tick.
             let received = if port.topic.signal == Signal::Command { ticks.saturating_sub(1) } else { ticks };
             LinkRead {
                 service: port.topic.to_string(),
@@ -229,8 +229,8 @@ impl<'a, R: Rig> Run<'a, R> {
     }
 }
 
-/// Ticks per second of the mathematics of all roles of a leader and a follower, called one after the other; none of others. If so
-/// told, with what a run cannot do without besides: the truths, and the hash of every sample.
+/// Measures the mathematics of all roles of a leader and a follower, called one after the other, in ticks per second. Returns
+/// `None` for other rigs. `hashed` adds what every run needs besides: the truths, and the hash of each sample.
 pub(crate) fn arithmetic_alone<R: Rig>(rig: &R, scenario: &Settings, hashed: bool) -> Option<f64> {
     let [BodyInfo { driven: false, fleet: None, .. }, BodyInfo { driven: true, fleet: None, .. }] = rig.bodies() else {
         return None;

@@ -1,6 +1,6 @@
-//! Scores a run from the truth and the estimates, which nobody in the loop ever sees together.
+//! Scores a run from the truth and the estimates. No role in the loop reads both.
 //!
-//! Must not hold the loop up, except by the credit it gives in lockstep.
+//! Must not delay the loop, except through the ticks that it permits in lockstep.
 
 use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::Grid;
@@ -15,7 +15,7 @@ use std::collections::BTreeMap;
 /// The score of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Score {
-    /// Ticks at which every sample was there.
+    /// Ticks at which every sample was present.
     pub scored_ticks: u64,
     /// Ticks at which some sample was missing.
     pub unscored_ticks: u64,
@@ -23,98 +23,98 @@ pub struct Score {
     pub faulted_ticks: u64,
     /// One entry per metric of the rig.
     pub metrics: Vec<MetricScore>,
-    /// How the live certificate fared, if the rig has one.
+    /// The result of the live certificate, if the rig has one.
     pub certificate: Option<CertificateScore>,
-    /// Samples received per signal that is scored, by service.
+    /// Samples received per scored signal, by service.
     #[serde(skip)]
     pub received: Vec<(String, u64)>,
-    /// Per signal, at how many ticks its status said what; only what was said.
+    /// Per signal and status bit, the number of ticks with this bit set; zero counts are left out.
     pub statuses: BTreeMap<String, BTreeMap<String, u64>>,
-    /// Per incident that the loop recovered from, by its number: the time from its tick until every metric with a limit was within
-    /// it for good, or until the next incident, s.
+    /// Recovery time per incident number, s: from the incident's tick until every metric with a limit stays within it, to the end or
+    /// to the next incident.
     #[serde(skip)]
     pub recoveries_s: BTreeMap<u64, f64>,
 }
 
-/// For how many steps of all driven bodies the bound on V̇ held, of the true errors: V(k+1) ≤ V(k) + h·bound(k). Together
-/// these are all steps: a tick of a body is one.
+/// The number of steps for which the bound on V̇ held for the true errors: V(k+1) ≤ V(k) + h·bound(k). A step is one tick of
+/// one driven body; the three counts add up to all steps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct CertificateScore {
-    /// It held, or V was at the floor of rounding.
+    /// Steps for which the bound held, or V was at the rounding floor.
     pub held: u64,
-    /// It did not.
+    /// Steps for which the bound did not hold.
     pub broken: u64,
-    /// Nothing can be said: before the first command acts, around missed ticks, and where nothing was observable.
+    /// Steps without a verdict: before the first command acts, around missed ticks, and while the motion was unobservable.
     pub unjudged: u64,
 }
 
-/// Status bits of an estimate that saw nothing of what it tells.
+/// Status bits of an estimate that rests on no information about the hidden component.
 const BLIND: u64 = status::UNOBSERVABLE | status::UNUSABLE | status::INITIAL;
 
-/// V from which on its change over one tick is more than rounding, for rates of the order of 1 rad/s.
+/// Returns the V above which its change over one tick exceeds rounding, for rates of the order of 1 rad/s.
 ///
 /// The reconstruction of ε divides the rounding of a measured increment by h, and the change of V over a tick is a part h
-/// of V: errors count from rounding/h² on.
+/// of V. Errors are therefore significant from rounding/h² on.
 pub fn lyapunov_floor(tick_s: f64) -> f64 {
     let error = 64.0 * f64::EPSILON / (tick_s * tick_s);
     error * error
 }
 
-/// The score by one metric.
+/// The score of one metric.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MetricScore {
-    /// Its name; the unit is the last part.
+    /// The metric's name; the unit is the last part.
     pub name: String,
-    /// At the last tick that could be scored; NaN where none could.
+    /// The value at the last scored tick; NaN if no tick was scored.
     #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub last: f64,
-    /// The largest value from `accept.settled_by_s` on; none if nothing was scored by then.
+    /// The largest value from `accept.settled_by_s` on; `None` if no tick was scored from there on.
     pub settled_max: Option<f64>,
-    /// The largest value from `accept.peak_from_s` on, settled or not; none if nothing was scored by then.
+    /// The largest value from `accept.peak_from_s` on, settled or not; `None` if no tick was scored from there on.
     pub peak: Option<f64>,
-    /// The tick of that.
+    /// The tick of the peak.
     pub peak_tick: Option<u64>,
-    /// From this time on it stayed within the accepted limit, s; none without a limit or if it did not.
+    /// The time from which the value stayed within its limit, s; `None` without a limit, or if it did not stay there.
     pub settled_at_s: Option<f64>,
-    /// The integral of its square over the run: (its unit)² s; a tick at which it could not be scored adds nothing.
+    /// The integral of the squared value over the run, (unit)² s; unscored ticks add nothing.
     #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub ise: f64,
-    /// Ticks from `accept.settled_by_s` on that were passed over without a value.
+    /// Ticks without a value from `accept.settled_by_s` on.
     #[serde(skip)]
     pub settled_blank: u64,
-    /// Ticks from `accept.peak_from_s` on that were passed over without a value.
+    /// Ticks without a value from `accept.peak_from_s` on.
     #[serde(skip)]
     pub peak_blank: u64,
-    /// What is accepted; infinite without a limit.
+    /// The largest accepted value; infinite without a limit.
     #[serde(skip)]
     limit: f64,
     #[serde(skip)]
     last_above: Option<u64>,
 }
 
-/// Follows a run.
+/// A scorer that follows a run.
 pub trait Scorer {
-    /// Scores up to `budget` ticks that have arrived; returns how many.
+    /// Scores up to `budget` ticks whose samples have arrived. Returns the number of ticks scored.
     ///
     /// # Errors
     /// [`BusError::Receive`].
     fn poll(&mut self, budget: u64) -> Result<u64, BusError>;
-    /// The next tick to score: every tick before it has been consumed.
+    /// Returns the next tick to score; every tick before it has been consumed.
     fn next_tick(&self) -> u64;
-    /// The latest value of the first metric.
+    /// Returns the latest value of the first metric.
     fn latest(&self) -> f64;
-    /// Hands over the time grid, once the epoch is known: no sample is of a tick that is not due.
+    /// Sets the time grid once the epoch is known. Samples of ticks that are not yet due are refused from then on.
     fn start(&mut self, grid: Grid);
-    /// Notes that a role failed at a tick; the recovery is told by the number of the incident.
+    /// Records that a role failed at a tick; `id` is the incident number in [`Score::recoveries_s`].
     fn incident(&mut self, id: u64, tick: u64);
-    /// Scores what is there, complete or not, and closes the account.
+    /// Scores the remaining samples, complete or not, and returns the score.
     ///
     /// # Errors
     /// [`BusError::Receive`].
     fn finish(&mut self) -> Result<Score, BusError>;
 }
 
-/// The same for a rig whose type is known.
+/// Opens the scorer of a rig.
 pub(crate) fn score_rig<R: Rig, B: Bus + 'static>(
     rig: &R,
     scenario: &Settings,
@@ -126,11 +126,11 @@ pub(crate) fn score_rig<R: Rig, B: Bus + 'static>(
 /// A driven body, for the live certificate.
 struct DrivenBody {
     body: usize,
-    /// Tick, V, and the bound on V̇, of the tick before.
+    /// The previous tick with its V and its bound on V̇.
     before: Option<(u64, f64, f64)>,
 }
 
-/// The status bits of a sample; none where its type has no field `status`.
+/// Returns the status bits of a sample, 0 if its type has no field `status`.
 #[inline]
 fn status_of<S: Sample>(sample: &S) -> u64 {
     match const { field_named(S::FIELDS, "status") } {
@@ -139,7 +139,7 @@ fn status_of<S: Sample>(sample: &S) -> u64 {
     }
 }
 
-/// How often the status of a signal's samples said what.
+/// The number of a signal's samples with each status bit set.
 struct Statuses {
     signal: String,
     counts: [u64; status::NAMES.len()],
@@ -150,25 +150,25 @@ impl Statuses {
         Self { signal: format!("{body}/{}", signal.name()), counts: [0; status::NAMES.len()] }
     }
 
-    /// Counts what a sample says. Most say nothing.
+    /// Counts the status bits of a sample. Most samples have none.
     #[inline]
     fn take<S: Sample>(&mut self, sample: &S) {
-        let told = status_of(sample);
-        if told != 0 {
+        let bits = status_of(sample);
+        if bits != 0 {
             let counts = self.counts.iter_mut().zip(status::NAMES);
-            counts.for_each(|(count, (_, bit))| *count += u64::from(told & bit != 0));
+            counts.for_each(|(count, (_, bit))| *count += u64::from(bits & bit != 0));
         }
     }
 
-    /// What was said, by name; that an estimate begins with its guess is nothing to tell.
-    fn told(&self) -> impl Iterator<Item = (&'static str, u64)> {
+    /// Returns the counts above zero by name, without `INITIAL`: every estimate begins with its guess.
+    fn named(&self) -> impl Iterator<Item = (&'static str, u64)> {
         let counts = status::NAMES.into_iter().zip(self.counts);
-        let told = counts.filter(|((_, bit), count)| *count > 0 && *bit != status::INITIAL);
-        told.map(|((name, _), count)| (name, count))
+        let nonzero = counts.filter(|((_, bit), count)| *count > 0 && *bit != status::INITIAL);
+        nonzero.map(|((name, _), count)| (name, count))
     }
 }
 
-/// The truth of a body, or of a fleet.
+/// The truth signal of a body or a fleet.
 enum TruthInput<R: Rig, B: Bus> {
     One(Input<B, Truth<R>>),
     Fleet(Input<B, FleetTruth<R>>),
@@ -211,7 +211,7 @@ impl<R: Rig, B: Bus> TruthInput<R, B> {
         }
     }
 
-    /// That of the sample at hand.
+    /// Returns the stamp of the current sample.
     fn stamp(&self) -> Option<&Stamp> {
         match self {
             Self::One(input) => input.sample().map(Message::stamp),
@@ -219,13 +219,13 @@ impl<R: Rig, B: Bus> TruthInput<R, B> {
         }
     }
 
-    /// The sample at hand if it is that tick's and a single body's.
-    fn one(&self, tick: u64) -> Option<&Truth<R>> {
+    /// Returns the current sample if it belongs to that tick and to a single body.
+    fn body_sample(&self, tick: u64) -> Option<&Truth<R>> {
         if let Self::One(input) = self { at(input, tick) } else { None }
     }
 
-    /// The sample at hand if it is that tick's and a fleet's.
-    fn fleet(&self, tick: u64) -> Option<&FleetTruth<R>> {
+    /// Returns the current sample if it belongs to that tick and to a fleet.
+    fn fleet_sample(&self, tick: u64) -> Option<&FleetTruth<R>> {
         if let Self::Fleet(input) = self { at(input, tick) } else { None }
     }
 }
@@ -237,18 +237,18 @@ struct RigScorer<R: Rig, B: Bus> {
     scoring: Scoring<R>,
 }
 
-/// The score in the making, whoever has the samples.
+/// The score as it grows tick by tick, independent of how the samples arrive.
 pub(crate) struct Scoring<R: Rig> {
     rig: R,
     accept: Accept,
     tick_s: f64,
     delay_ticks: u64,
     driven: Vec<DrivenBody>,
-    /// Of the estimate, and of every body's truth.
+    /// The status counts of the estimate, then of every body's truth.
     statuses: Vec<Statuses>,
     services: Vec<String>,
     next_tick: u64,
-    /// Per incident: its number, its tick, and the last tick from there on at which some metric was not known to be within its limit.
+    /// Per incident: its number, its tick, and the last tick since at which some metric was not known to be within its limit.
     incidents: Vec<(u64, u64, u64)>,
     values: Vec<f64>,
     score: Score,
@@ -257,7 +257,7 @@ pub(crate) struct Scoring<R: Rig> {
 impl<R: Rig> Scoring<R> {
     pub fn new(rig: &R, scenario: &Settings) -> Self {
         let bodies = rig.bodies().iter();
-        // The certificate is about single bodies.
+        // The certificate covers single bodies only.
         let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven && body.fleet.is_none());
         let estimates = Statuses::new(&rig.bodies()[0].name, Signal::Estimate);
         let truths = bodies.clone().map(|body| Statuses::new(&body.name, Signal::Truth));
@@ -300,12 +300,12 @@ impl<R: Rig> Scoring<R> {
         }
     }
 
-    /// The latest value of the first metric.
+    /// Returns the latest value of the first metric.
     pub fn latest(&self) -> f64 {
         self.score.metrics.first().map_or(f64::NAN, |metric| metric.last)
     }
 
-    /// Scores the next tick by the samples of it that there are; `complete` tells whether these are all.
+    /// Scores the next tick from its available samples; `complete` is true if none is missing.
     #[inline]
     pub fn take<'a>(
         &mut self,
@@ -332,9 +332,9 @@ impl<R: Rig> Scoring<R> {
         }
         let (estimates, truths) = self.statuses.split_at_mut(1);
         estimate.iter().for_each(|estimate| estimates[0].take(*estimate));
-        let told = truths.iter_mut().enumerate();
-        told.for_each(|(body, statuses)| truth(body).iter().for_each(|truth| statuses.take(*truth)));
-        // What the observer was not told of cannot be judged.
+        let per_body = truths.iter_mut().enumerate();
+        per_body.for_each(|(body, statuses)| truth(body).iter().for_each(|truth| statuses.take(*truth)));
+        // The certificate cannot be judged from an estimate without information.
         let seen = estimate.filter(|estimate| status_of(*estimate) & BLIND == 0);
         for driven in &mut self.driven {
             let (observed, own) = (truth(0), truth(driven.body));
@@ -342,19 +342,19 @@ impl<R: Rig> Scoring<R> {
                 (Some(observed), Some(own), Some(estimate)) => self.rig.true_lyapunov(observed, own, estimate),
                 _ => None,
             };
-            // A follower that held or was safe did not apply what the certificate is about.
+            // A follower in hold or in safe state did not apply the command that the certificate assumes.
             let undisturbed = own.is_some_and(|truth| R::undisturbed(truth));
             driven.judge(tick, (self.tick_s, self.delay_ticks), now, undisturbed, &mut self.score.certificate);
         }
         self.next_tick += 1;
     }
 
-    /// Whether every metric that has a limit is known and within it.
+    /// Returns true if every metric with a limit is known and within it.
     fn within(&self) -> bool {
         self.score.metrics.iter().zip(&self.values).all(|(metric, value)| *value <= metric.limit)
     }
 
-    /// The recoveries, as far as there are limits to recover to.
+    /// Returns the recovery times; empty if no metric has a limit.
     fn recoveries_s(&self) -> BTreeMap<u64, f64> {
         let recovery = |&(id, from, last_outside): &(u64, u64, u64)| {
             let back = last_outside + 1;
@@ -364,7 +364,7 @@ impl<R: Rig> Scoring<R> {
         self.incidents.iter().filter_map(recovery).collect()
     }
 
-    /// Closes the account. `received` holds how many samples came, of the estimate and of every body's truth.
+    /// Completes the score. `received` yields the sample counts of the estimate, then of every body's truth.
     pub fn finish(&mut self, received: impl Iterator<Item = u64>) -> Score {
         let services = self.services.iter().cloned();
         self.score.received = services.zip(received).collect();
@@ -373,13 +373,13 @@ impl<R: Rig> Scoring<R> {
             let steps = self.next_tick * self.driven.len() as u64;
             certificate.unjudged = steps - certificate.held - certificate.broken;
         }
-        let told = |statuses: &Statuses| {
+        let named = |statuses: &Statuses| {
             (
                 statuses.signal.clone(),
-                statuses.told().map(|(name, ticks)| (name.to_owned(), ticks)).collect::<BTreeMap<_, _>>(),
+                statuses.named().map(|(name, ticks)| (name.to_owned(), ticks)).collect::<BTreeMap<_, _>>(),
             )
         };
-        self.score.statuses = self.statuses.iter().map(told).filter(|(_, told)| !told.is_empty()).collect();
+        self.score.statuses = self.statuses.iter().map(named).filter(|(_, counts)| !counts.is_empty()).collect();
         let (tick_s, ticks) = (self.tick_s, self.next_tick);
         for metric in &mut self.score.metrics {
             let first_within = metric.last_above.map_or(0, |tick| tick + 1);
@@ -392,7 +392,7 @@ impl<R: Rig> Scoring<R> {
 
 impl<R: Rig, B: Bus> RigScorer<R, B> {
     fn open(rig: &R, scenario: &Settings, bus: &B) -> Result<Self, BusError> {
-        // What no role uses is not scored either.
+        // Guard and lateness are those of the roles: a sample that they refuse is not scored.
         let mut estimate = Input::open(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?
             .with_late(LateSamples::for_signal(scenario, Signal::Estimate, &rig.bodies()[0].name))
             .with_guard(rig.estimate_guard());
@@ -406,7 +406,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         })
     }
 
-    /// Whether no sample of the next tick can still come.
+    /// Returns true if no sample of the next tick can still arrive.
     fn settled(&mut self) -> Result<bool, BusError> {
         let next = self.scoring.next_tick;
         let mut waiting = self.estimate.seek(next)? == Seek::NotYet;
@@ -422,12 +422,17 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         let complete =
             estimate.is_some() && self.truths.iter().all(|truth| truth.stamp().is_some_and(|stamp| stamp.tick == tick));
         let truths = &self.truths;
-        self.scoring.take(|body| truths[body].one(tick), |body| truths[body].fleet(tick), estimate, complete);
+        self.scoring.take(
+            |body| truths[body].body_sample(tick),
+            |body| truths[body].fleet_sample(tick),
+            estimate,
+            complete,
+        );
     }
 }
 
 impl DrivenBody {
-    /// Judges one step by what is known of V now.
+    /// Judges the step from the previous tick to this one; `now` holds V and the bound on V̇, if known.
     #[inline]
     fn judge(
         &mut self,
@@ -440,7 +445,7 @@ impl DrivenBody {
         let now = now.filter(|(v, bound)| v.is_finite() && bound.is_finite());
         if let Some((v, _)) = now {
             let score = score.get_or_insert_default();
-            // V is under control from where the first command acts.
+            // V is controlled only once the first command acts.
             if let Some((before, v_before, bound)) = self.before
                 && before + 1 == tick
                 && before >= delay_ticks
@@ -454,7 +459,7 @@ impl DrivenBody {
     }
 }
 
-/// The sample at hand if it is that tick's.
+/// Returns the current sample if it belongs to that tick.
 fn at<B: Bus, S: Carried + ?Sized, G: Guard<S>>(input: &Input<B, S, G>, tick: u64) -> Option<&S> {
     input.sample().filter(|sample| sample.stamp().tick == tick)
 }
@@ -511,7 +516,7 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
     }
 
     fn finish(&mut self) -> Result<Score, BusError> {
-        // What has not come by now never will: go on as long as anything newer waits anywhere.
+        // A sample that has not arrived by now is lost: continue while any input holds a newer one.
         loop {
             self.poll(u64::MAX)?;
             let newest = |tick: Option<u64>| tick.is_some_and(|tick| tick >= self.scoring.next_tick);

@@ -1,6 +1,6 @@
-//! One driven body's loop in one place: the roles' own state machines, tick by tick, without links and clocks.
+//! Runs one driven body's loop tick by tick with the roles' own state machines, without links and clocks.
 //!
-//! It gives the bits of an undisturbed run. Must not compute anything that a role computes.
+//! It gives the bits of an undisturbed run. Must not repeat the computation of a role.
 
 use crate::rig::{Command, Estimate, Measurement, Rig, Truth};
 use crate::role::{Actuation, Controller, Guard, Observer, Plant, Rearm, SUSPECT_SAMPLES};
@@ -11,23 +11,23 @@ use crate::state::{Persist, Words};
 pub(super) struct Chain<R: Rig> {
     rig: R,
     observed: Plant<R::Body>,
-    /// None if the observed body is the driven one.
+    /// `None` if the observed body is itself driven.
     driven: Option<Plant<R::Body>>,
     observer: Observer<R::Estimator>,
     controller: Controller<R::Law>,
     measurement: Measurement<R>,
     own: Measurement<R>,
-    /// Those on their way and the one that acts, by their tick modulo the delay.
+    /// The commands in flight and the one that acts, indexed by their tick modulo the delay.
     commands: Vec<Command<R>>,
     truths: [Truth<R>; 2],
     estimate: Estimate<R>,
-    /// What the loop is to control of the truth, and of the estimate.
+    /// The controlled fields of the truth, and of the estimate.
     controlled: [Vec<&'static Field>; 2],
     tick: u64,
 }
 
 impl<R: Rig> Chain<R> {
-    /// The loop of a rig whose last body is the driven one, at its start.
+    /// Creates the loop, at its start, of a rig whose last body is the driven one.
     pub fn new(rig: &R, tick_s: f64, delay_ticks: u64) -> Self {
         let last = rig.bodies().len() - 1;
         let plant = |index: usize| {
@@ -52,19 +52,19 @@ impl<R: Rig> Chain<R> {
         }
     }
 
-    fn place(&self, tick: u64) -> usize {
+    fn command_index(&self, tick: u64) -> usize {
         (tick % self.commands.len() as u64) as usize
     }
 
-    /// The command made last.
+    /// Returns the newest command.
     fn command(&self) -> &Command<R> {
-        &self.commands[self.place(self.tick - 1)]
+        &self.commands[self.command_index(self.tick - 1)]
     }
 
-    /// One tick: measure, estimate, command, move on, and hand over the command that is to act then. With a delay of one tick
-    /// nothing is in flight between two ticks.
+    /// Runs one tick: measure, estimate, command, advance the bodies, and apply the command that is due next. With a delay of one
+    /// tick no command is in flight between two ticks.
     pub fn advance(&mut self) {
-        let (made, acts) = (self.place(self.tick), self.place(self.tick + 1));
+        let (newest, due) = (self.command_index(self.tick), self.command_index(self.tick + 1));
         let stamp = Stamp { tick: self.tick, generation: 1, ..Stamp::default() };
         self.observed.measure(&stamp, &mut self.measurement);
         self.observer.step(&self.measurement, &mut self.estimate);
@@ -74,107 +74,107 @@ impl<R: Rig> Chain<R> {
             Some(driven) => {
                 driven.measure(&stamp, &mut self.own);
                 driven.truth(&stamp, &mut self.truths[1]);
-                self.controller.step(&self.estimate, &self.own, &mut self.commands[made]);
+                self.controller.step(&self.estimate, &self.own, &mut self.commands[newest]);
                 driven.advance(1);
-                driven.command(self.tick, Some(&self.commands[acts]));
+                driven.command(self.tick, Some(&self.commands[due]));
                 self.observed.advance(1);
             }
             None => {
-                self.controller.step(&self.estimate, &self.measurement, &mut self.commands[made]);
+                self.controller.step(&self.estimate, &self.measurement, &mut self.commands[newest]);
                 self.observed.advance(1);
-                self.observed.command(self.tick, Some(&self.commands[acts]));
+                self.observed.command(self.tick, Some(&self.commands[due]));
             }
         }
     }
 
-    /// The rig's metrics at the last tick, in its order.
+    /// Computes the rig's metrics at the last tick, in the rig's order.
     pub fn score(&self, out: &mut [f64]) {
         self.rig.score(|index| self.truths.get(index), |_| None, Some(&self.estimate), out);
     }
 
-    /// Which body's motion has ended, and how, if one's has.
+    /// Returns the first body whose motion has ended, with the reason.
     pub fn loss(&self) -> Option<String> {
         let losses = self.truths.iter().zip(self.rig.bodies());
         losses.filter_map(|(truth, body)| Some(format!("{} {}", body.name, self.rig.loss(truth)?))).next()
     }
 
-    /// Every number of the driven body's motion and of the estimate at the last tick that the loop is to control.
+    /// Writes the controlled numbers of the driven body's truth and of the estimate at the last tick.
     pub fn output(&self, out: &mut Vec<f64>) {
         out.clear();
         self.controlled[0].iter().for_each(|field| out.extend(values(self.truth(), field)));
         self.controlled[1].iter().for_each(|field| out.extend(values(&self.estimate, field)));
     }
 
-    /// Every number of the observed body's motion that the loop is to control.
+    /// Writes the controlled numbers of the observed body's truth.
     pub fn observed(&self, out: &mut Vec<f64>) {
         out.clear();
         self.controlled[0].iter().for_each(|field| out.extend(values(&self.truths[0], field)));
     }
 
-    /// The driven body's coordinate that the loop does not control.
+    /// Returns the driven body's coordinate that the loop does not control.
     pub fn free(&self) -> f64 {
         let field = numbers::<Truth<R>>().find(|field| R::FREE == Some(field.name));
         field.and_then(|field| values(self.truth(), field).next()).unwrap_or(0.0)
     }
 
-    /// The driven body's.
+    /// Returns the driven body's truth.
     fn truth(&self) -> &Truth<R> {
         &self.truths[usize::from(self.driven.is_some())]
     }
 
-    /// The bits of the estimate's `status` at the last tick.
+    /// Returns the status bits of the estimate at the last tick.
     pub fn status(&self) -> u64 {
         let field = Estimate::<R>::FIELDS.iter().find(|field| field.name == "status");
         field.map_or(0, |field| self.estimate.words()[field.offset / 8])
     }
 
-    /// Passes what the loop remembers, but for the motion that it is to follow.
-    fn state<W: Words>(&mut self, words: &mut W) {
+    /// Passes the state of the loop, without that of the motion to follow.
+    fn state<W: Words>(&mut self, visitor: &mut W) {
         match &mut self.driven {
-            Some(driven) => driven.persist(words),
-            None => self.observed.persist(words),
+            Some(driven) => driven.persist(visitor),
+            None => self.observed.persist(visitor),
         }
-        self.observer.persist(words);
-        self.controller.persist(words);
-        // The plant has the one that acts.
+        self.observer.persist(visitor);
+        self.controller.persist(visitor);
+        // The plant holds the command that acts.
         let (tick, count) = (self.tick, self.commands.len() as u64);
         for command in (1..count).map(|after| ((tick + after) % count) as usize) {
-            let sent = self.commands[command].words_mut();
+            let words = self.commands[command].words_mut();
             for field in numbers::<Command<R>>() {
-                for bits in &mut sent[field.offset / 8..][..field.count] {
+                for bits in &mut words[field.offset / 8..][..field.count] {
                     let mut number = f64::from_bits(*bits);
-                    words.number(&mut number);
+                    visitor.number(&mut number);
                     *bits = number.to_bits();
                 }
             }
         }
     }
 
-    /// The numbers of the state.
+    /// Returns the numbers of the state.
     pub fn numbers(&mut self) -> Vec<f64> {
         let mut numbers = Numbers(Vec::new());
         self.state(&mut numbers);
         numbers.0
     }
 
-    /// Takes from every number of the state what `away` has, and then makes its distance from `from` so many times as large.
+    /// Subtracts `away` from every number of the state, then scales its distance from `from` by `factor`.
     pub fn stretch(&mut self, from: &[f64], away: &[f64], factor: f64) {
         self.state(&mut Stretch { from, away, factor });
     }
 }
 
-/// The guards of the loop's readers. They look on: what they refuse takes part in the loop all the same.
+/// The guards of the loop's readers. They only observe: the loop uses a refused sample all the same.
 pub(super) struct Guards<R: Rig> {
     measurement: R::MeasurementGuard,
     estimate: R::EstimateGuard,
     own: R::MeasurementGuard,
     command: R::CommandGuard,
-    /// How many samples in a row each has refused.
+    /// The number of samples in a row that each guard has refused.
     refused: [u64; 4],
 }
 
 impl<R: Rig> Guards<R> {
-    /// Those of a rig whose last body is the driven one.
+    /// Creates the guards of a rig whose last body is the driven one.
     pub fn new(rig: &R) -> Self {
         let last = rig.bodies().len() - 1;
         Self {
@@ -186,8 +186,8 @@ impl<R: Rig> Guards<R> {
         }
     }
 
-    /// Judges the samples of the last tick. Tells which of them has been refused for longer than a guard doubts what is
-    /// right, if one has.
+    /// Judges the samples of the last tick. Returns the name of one that was refused more than [`SUSPECT_SAMPLES`] times in a row:
+    /// a guard doubts a correct sample for no longer than that.
     pub fn refuse(&mut self, chain: &Chain<R>) -> Option<&'static str> {
         let own = if chain.driven.is_some() { &chain.own } else { &chain.measurement };
         let accepted = [
@@ -204,7 +204,7 @@ impl<R: Rig> Guards<R> {
     }
 }
 
-/// The fields of a sample that are numbers.
+/// Returns the fields of a sample that hold numbers.
 fn numbers<S: Sample>() -> impl Iterator<Item = &'static Field> {
     S::FIELDS.iter().filter(|field| field.kind == FieldKind::F64)
 }
@@ -236,11 +236,11 @@ struct Stretch<'a> {
 }
 
 impl Stretch<'_> {
-    /// The next number of where the distance is measured from, and of what is taken away.
+    /// Returns the next pair of numbers of `from` and `away`.
     fn next(&mut self) -> Option<(f64, f64)> {
         let (from, rest) = self.from.split_first()?;
-        let (away, further) = self.away.split_first().unwrap_or((&0.0, &[]));
-        (self.from, self.away) = (rest, further);
+        let (away, rest_away) = self.away.split_first().unwrap_or((&0.0, &[]));
+        (self.from, self.away) = (rest, rest_away);
         Some((*from, *away))
     }
 }
@@ -254,8 +254,8 @@ impl Words for Stretch<'_> {
         *value = if moved.is_finite() { moved } else { from };
     }
 
-    /// Where nothing errs, weights change nothing: a small difference in them is no part of the linearised loop. It falls more
-    /// slowly than the error, and would outgrow it by being stretched with it.
+    /// Resets a weight to that of the reference. Without an error, weights have no effect: a small difference in them is not part
+    /// of the linearised loop. It decays more slowly than the error, and scaling it with the error would let it outgrow that.
     fn weight(&mut self, value: &mut f64) {
         *value = self.next().map_or(*value, |(from, _)| from);
     }

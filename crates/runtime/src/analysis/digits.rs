@@ -1,6 +1,6 @@
-//! Numbers with the digits that are known. Must not judge them.
+//! Formats numbers with their significant digits. Must not judge them.
 
-/// A number in four digits or more, however small it is.
+/// Formats a number with at least four significant digits, however small it is.
 pub fn digits(value: f64) -> String {
     let decimals = match value.abs() {
         0.1..1e6 => 4,
@@ -13,7 +13,7 @@ pub fn digits(value: f64) -> String {
     text.trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
-/// Formats a number that is known to a tolerance, with one decimal more than the tolerance has; a whole number stands as it is.
+/// Formats a number with one decimal more than its tolerance has; a whole number gets no decimals.
 pub fn to_tolerance(value: f64, tolerance: f64) -> String {
     let power = |value: f64| value.abs().log10().floor() as i32;
     let last = power(tolerance) - 1;
@@ -26,7 +26,7 @@ pub fn to_tolerance(value: f64, tolerance: f64) -> String {
     }
 }
 
-/// Two numbers that are compared, with enough digits to be told apart.
+/// Formats two numbers for comparison, with enough digits to distinguish them.
 pub fn apart(a: f64, b: f64) -> [String; 2] {
     let few = [a, b].map(digits);
     if few[0] == few[1] { [a, b].map(|value| value.to_string()) } else { few }
@@ -37,7 +37,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_tolerance_says_how_many_digits_a_number_has() {
+    fn a_tolerance_sets_the_number_of_digits() {
         for (value, tolerance, text) in [
             (0.5541015625000001, 0.01, "0.554"),
             (3.642_089_843_75, 0.5, "3.64"),
@@ -55,8 +55,8 @@ mod tests {
 
     #[test]
     fn small_numbers_have_digits() {
-        let told = [0.0, 4.0, 0.25, 0.0123456, 0.002, 1.5e-7, -2e-4].map(digits);
-        assert_eq!(told, ["0", "4", "0.25", "0.01235", "0.002", "1.500e-7", "-2.000e-4"]);
+        let texts = [0.0, 4.0, 0.25, 0.0123456, 0.002, 1.5e-7, -2e-4].map(digits);
+        assert_eq!(texts, ["0", "4", "0.25", "0.01235", "0.002", "1.500e-7", "-2.000e-4"]);
         assert_eq!(apart(1.0, 0.99999), ["1", "0.99999"]);
         assert_eq!(apart(0.5, 0.25), ["0.5", "0.25"]);
     }

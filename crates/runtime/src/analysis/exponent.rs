@@ -1,6 +1,6 @@
-//! The largest exponent of a loop's error, and whether it is one rate.
+//! Computes the largest exponent of a loop's error, and checks that it is a uniform rate.
 //!
-//! Must not derive by hand what the code does: two loops run beside each other, and the logarithm of their distance tells.
+//! It runs two loops side by side; the logarithm of their distance gives the exponent. Must not derive it from equations by hand.
 
 use super::chain::Chain;
 use super::digits::digits;
@@ -8,38 +8,39 @@ use super::subject::{Analysis, LOST, TICKS_MAX, TICKS_MIN, exceeds, norm};
 use crate::rig::{Rig, Start};
 use crate::sample::status;
 
-/// The distance of the two loops, over the size of what they say.
+/// The distance of the two loops, relative to the size of their output.
 const DISTANCE: f64 = 1e-5;
-/// It is set back once it has fallen to, or grown by, so much. What the loop does not control does not fall, so it must not
-/// wait for long: squares of it would show beside the distance.
+/// The distance is reset once it has fallen or grown by these factors. The uncontrolled coordinate does not fall, so resets must
+/// be frequent: otherwise its square becomes visible beside the distance.
 const FALLEN: f64 = 0.1;
 const GROWN: f64 = 10.0;
-/// Below this, over the size of what they say, it is rounding.
+/// Distances below this, relative to the size of the output, are rounding.
 const ROUNDING: f64 = 1e-11;
-/// The parts of the ticks looked at must give one rate, to within this part of it: two of them where the error fell by
-/// e^-[`FALL`] in all, as it must unless that takes more than [`TICKS_MAX`]: before, what falls more slowly may not have
-/// shown; else four.
+/// Equal parts of the examined ticks must agree on the rate to within this fraction of it. There are two parts if the error fell
+/// by e^-[`FALL`] in all, else four. It must fall that far unless that takes more than [`TICKS_MAX`]: a slower mode may not
+/// have appeared before.
 pub(super) const AGREEMENT: f64 = 0.03;
 const FALL: f64 = 20.0;
-/// Wherever the error falls by so much, e^-depth, it must do so at that rate to within this factor: a run may come to its
-/// floor before the motion comes back, or before the error has swung once. Three decades, and six.
+/// Pairs of depth and factor: each fall by e^-depth must have that rate to within the factor. A run may reach its floor before
+/// the motion repeats, or before the error has oscillated once. The depths are three and six decades.
 const UNIFORM: [(f64, f64); 2] = [(6.9, 1.6), (13.8, 1.15)];
 
-/// An exponent, and how much of the motion it speaks of.
+/// An exponent, and how uniform it is along the motion.
 pub(super) struct Exponent {
-    /// How fast the distance fell, 1/s: over all ticks looked at but the first quarter, and over equal parts of those.
+    /// The rate at which the distance fell, 1/s, over all examined ticks but the first quarter.
     rate_per_s: f64,
+    /// The same over equal parts of these ticks, 1/s.
     parts_per_s: Vec<f64>,
-    /// The slowest and the fastest of all falls so deep as [`UNIFORM`] has them, 1/s.
+    /// The slowest and the fastest of all falls by each depth of [`UNIFORM`], 1/s.
     local_per_s: [[f64; 2]; 2],
-    /// Part of the ticks at which the observer was told nothing.
+    /// The fraction of ticks without information for the observer.
     unobserved: f64,
-    /// The size of what the loop says where it is settled.
+    /// The size of the settled loop's output.
     pub size: f64,
 }
 
 impl<R: Rig> Analysis<'_, R> {
-    /// The largest exponent of the loop about the motion that it is to follow.
+    /// Computes the largest exponent of the loop about the motion that it follows.
     pub fn exponent(&self, ideal: &R) -> Exponent {
         let begun = |start| {
             self.rig
@@ -52,11 +53,11 @@ impl<R: Rig> Analysis<'_, R> {
         reference.output(&mut here);
         let size = norm(&here).max(f64::MIN_POSITIVE);
         let Some(mut near) = begun(Start::Off(DISTANCE * size)) else { unreachable!("as the settled one was") };
-        // What the loop does not control does not decay, and is taken out again and again.
+        // The uncontrolled coordinate does not decay, so it is removed at every reset.
         let mut shifted = R::FREE.and_then(|_| begun(Start::Shifted(DISTANCE)));
         near.advance();
         shifted.iter_mut().for_each(Chain::advance);
-        let (mut fallen, mut since, mut unobserved) = (0.0, None, 0_u64);
+        let (mut fallen, mut reset_distance, mut unobserved) = (0.0, None, 0_u64);
         // The logarithm by which the distance has fallen, after every tick.
         let mut falls = Vec::new();
         let mut end = TICKS_MIN.max(self.scenario.last_tick.min(TICKS_MAX / 32));
@@ -72,7 +73,7 @@ impl<R: Rig> Analysis<'_, R> {
                 near.output(&mut there);
                 here.iter_mut().zip(&there).for_each(|(here, there)| *here -= there);
                 let distance = norm(&here);
-                let from = *since.get_or_insert(distance);
+                let from = *reset_distance.get_or_insert(distance);
                 falls.push(fallen + (from / distance.max(ROUNDING * size)).ln());
                 unobserved += u64::from(reference.status() & (status::UNOBSERVABLE | status::UNUSABLE) != 0);
                 if !(FALLEN * DISTANCE * size..GROWN * DISTANCE * size).contains(&distance) {
@@ -83,7 +84,7 @@ impl<R: Rig> Analysis<'_, R> {
                         shifted.numbers().iter().zip(&from).map(|(shifted, from)| part * (shifted - from)).collect()
                     });
                     near.stretch(&from, &away, DISTANCE * size / distance.max(ROUNDING * size));
-                    since = Some(DISTANCE * size);
+                    reset_distance = Some(DISTANCE * size);
                 }
             }
             let slope = |from: usize, to: usize| slope(&falls[from..to]) / self.tick_s;
@@ -93,7 +94,7 @@ impl<R: Rig> Analysis<'_, R> {
                 slope(begin + index * length, begin + (index + 1) * length)
             };
             let rate_per_s = slope(begin, end_at);
-            // A slow swing may look straight in two parts, as long as little of the fall was seen.
+            // While little of the fall is known, a slow oscillation may look straight in two parts.
             let parts = if rate_per_s * (end_at - begin) as f64 * self.tick_s < FALL { 4 } else { 2 };
             let exponent = Exponent {
                 rate_per_s,
@@ -111,7 +112,7 @@ impl<R: Rig> Analysis<'_, R> {
         }
     }
 
-    /// Whether the exponent is a rate.
+    /// Returns the exponent if it is a uniform, positive rate, else the reason why not.
     pub fn judge(&self, exponent: &Exponent) -> Result<f64, String> {
         let Exponent { rate_per_s, parts_per_s, local_per_s, unobserved, .. } = exponent;
         if *unobserved > 0.5 {
@@ -146,7 +147,7 @@ impl<R: Rig> Analysis<'_, R> {
 }
 
 impl Exponent {
-    /// That of a loop which does not even stay where it is settled.
+    /// The exponent of a loop that diverges even from its settled state.
     const GROWS: Self = Self {
         rate_per_s: f64::NEG_INFINITY,
         parts_per_s: Vec::new(),
@@ -161,27 +162,28 @@ impl Exponent {
     }
 }
 
-/// The least and the greatest value.
+/// Returns the least and the greatest value.
 fn range(values: &[f64]) -> [f64; 2] {
     let extend = |[least, greatest]: [f64; 2], value: &f64| [value.min(least), value.max(greatest)];
     values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], extend)
 }
 
-/// How fast each stretch of a fall goes that is at least so deep, per step. What rises again has not fallen.
+/// Returns the slope of each stretch of a fall that is at least `depth` deep, per step. A part that rises again has not fallen.
 fn stretches(falls: &[f64], depth: f64) -> Vec<f64> {
     let mut falls = falls.to_vec();
     (1..falls.len()).rev().for_each(|step| falls[step - 1] = falls[step - 1].min(falls[step]));
     let mut end = 0;
-    let of = |begin: usize| {
+    let slope_from = |begin: usize| {
         while end < falls.len() && falls[end] - falls[begin] < depth {
             end += 1;
         }
         falls.get(end).map(|fallen| (fallen - falls[begin]) / (end - begin) as f64)
     };
-    (0..falls.len()).map_while(of).collect()
+    (0..falls.len()).map_while(slope_from).collect()
 }
 
-/// The slope of the straight line that is nearest to evenly spaced values, per step: what swings about the line counts little.
+/// Returns the slope of the least-squares line through evenly spaced values, per step. Oscillations about the line have little
+/// effect.
 pub(super) fn slope(values: &[f64]) -> f64 {
     let middle = 0.5 * (values.len() as f64 - 1.0);
     let moment = |(step, value): (usize, &f64)| (step as f64 - middle) * value;

@@ -1,25 +1,25 @@
-//! How fast the error of one run falls, from where it is small to its floor.
+//! Measures the decay rate of one run's error, from where it is small to its floor.
 //!
-//! Must not know what the errors are of.
+//! Must not know the meaning of the errors.
 
-/// An error is small below this part of its largest.
+/// An error is small below this fraction of its largest value.
 const SMALL: f64 = 1e-2;
-/// So many times its floor it still falls freely.
+/// Above this multiple of its floor an error falls freely.
 const FREE: f64 = 20.0;
-/// A rate is told by a fall so deep.
+/// A rate is measured over a fall by this factor.
 const DEPTH: f64 = 1e3;
-/// Of the motion's size: so far it must have gone, and so near it must come back.
+/// Fractions of the motion's size: the distance that it must have gone, and the distance to which it must return.
 const GONE: f64 = 0.05;
 const BACK: f64 = 0.02;
 
-/// The errors of a run, and the motion that is followed, tick by tick.
+/// The errors of a run and the motion that it follows, tick by tick.
 #[derive(Default)]
 pub(super) struct Fall {
-    /// By metric.
+    /// Per metric, the error of every tick.
     errors: Vec<Vec<f64>>,
     first: Vec<f64>,
     before: Vec<f64>,
-    /// How far the motion is from where it began, and how far it has gone since the tick before.
+    /// The motion's distance from its start, and from the previous tick.
     away: Vec<[f64; 2]>,
 }
 
@@ -35,7 +35,7 @@ impl Fall {
         self.before.copy_from_slice(motion);
     }
 
-    /// The ticks after which the motion is what it was: one if it rests, none if it does not come back.
+    /// Returns the period of the motion, ticks: 1 if it rests, `None` if it does not return.
     fn period(&self) -> Option<usize> {
         let size = distance(&self.first, &vec![0.0; self.first.len()]);
         let Some(gone) = self.away.iter().position(|[away, _]| *away > GONE * size) else { return Some(1) };
@@ -46,8 +46,8 @@ impl Fall {
         self.away[gone..].windows(3).enumerate().find_map(near)
     }
 
-    /// Two rates per tick: over the last decades, and by the nearest straight line over all; each over whole periods of the
-    /// motion. None where the fall is over before.
+    /// Returns two rates per tick: over the last decades, and by the least-squares line over the whole fall. Each covers whole
+    /// periods of the motion. Returns `None` if the fall ends before.
     pub fn rates(&self, floors: &[f64]) -> Option<[f64; 2]> {
         let largest: Vec<f64> =
             self.errors.iter().map(|errors| errors.iter().copied().fold(f64::MIN_POSITIVE, f64::max)).collect();
@@ -65,8 +65,8 @@ impl Fall {
     }
 }
 
-fn distance(one: &[f64], other: &[f64]) -> f64 {
-    one.iter().zip(other).map(|(one, other)| (one - other) * (one - other)).sum::<f64>().sqrt()
+fn distance(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
 }
 
 #[cfg(test)]
@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fall_has_its_rate_and_two_that_are_nearly_alike_have_none() {
+    fn an_exponential_has_its_rate_and_a_double_mode_has_a_lower_one() {
         let rests = |_: f64| 1.0;
         let [last, all] = fall(400, |tick| (-0.1 * tick).exp().max(1e-15), rests).rates(&[1e-15]).unwrap();
         assert!((last - 0.1).abs() < 1e-9 && (all - 0.1).abs() < 1e-9);
@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_over_before_the_motion_comes_back_tells_no_rate() {
+    fn a_fall_shorter_than_the_motions_period_has_no_rate() {
         let turns = |period: f64| move |tick: f64| core::f64::consts::TAU * tick / period;
         let falls = |tick: f64| (-0.1 * tick).exp().max(1e-15);
         assert!(fall(400, falls, turns(300.0)).rates(&[1e-15]).is_none());

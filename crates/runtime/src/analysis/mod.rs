@@ -1,11 +1,11 @@
-//! What may be claimed of the loop that runs: the rate at which its error falls, the floor that it falls to, and whether it
-//! gets there from the scenario's own start.
+//! Computes the convergence of the loop as it runs: the rate at which its error falls, the floor that it reaches, and whether
+//! it gets there from the scenario's own start.
 //!
-//! The loop is sampled, held and late by a tick or more, so the theorems about continuous time say nothing of its rate. Here the roles'
-//! own code is run in one thread (`chain.rs`): beside a loop that is synchronised from the start runs one that is off by a
-//! little, and the logarithm of their distance gives the largest exponent, which is a Floquet exponent where the leader's
-//! motion is periodic. The numbers of the state are those by which a killed role is continued, so none is forgotten, whatever
-//! the filter, the law and the delay are. Must not derive by hand what the code does.
+//! The loop is sampled, held and delayed by at least one tick, so the theorems about continuous time do not give its rate. Here
+//! the roles' own code runs in one thread (`chain.rs`): one loop is synchronised from the start, a second one is slightly off.
+//! The logarithm of their distance gives the largest exponent, which is a Floquet exponent if the leader's motion is periodic.
+//! The state is the one from which a killed role continues, so it is complete for every filter, law and delay. Must not derive
+//! the rate from equations by hand.
 
 mod chain;
 mod digits;
@@ -22,68 +22,68 @@ use fall::Fall;
 use serde::{Deserialize, Serialize};
 use subject::{Analysis, LOST, TICKS_MAX, TICKS_MIN, exceeds, norm};
 
-/// Ticks of a long scenario that are looked at if the rate does not ask for more.
+/// The most examined ticks of a long scenario, unless the rate needs more.
 const SCENARIO_TICKS_MAX: u64 = TICKS_MAX / 8;
-/// An error has settled after so many of its time constants, and a quarter of them more is looked at.
+/// The examined span in time constants of the error; it has settled after the first three quarters.
 const SETTLED: f64 = 60.0;
-/// The error of the scenario's own start must fall at that rate to within this factor, where it falls for long enough.
+/// From the scenario's own start the error must fall at the loop's rate to within this factor, if its fall is long enough.
 const OWN: f64 = 1.048;
-/// A start is small, and the linearisation speaks of it, below this part of the largest error.
+/// An error is small, so that the linearisation holds, below this fraction of the largest error.
 const SMALL: f64 = 1e-2;
-/// A loop whose floor is above this part of what it says synchronises nothing.
+/// A loop does not synchronise if its floor exceeds this fraction of its output.
 const USELESS: f64 = 0.05;
 const USELESS_REASON: &str = "even from where it is settled the error comes to a floor that is no synchronisation: rounding, \
                               quadrature or noise outweigh what the motion tells; raise tick_hz, or choose another axis";
-/// A loop that says so many times what it said at its start has diverged. A transient may be large: a wrong first guess at a
-/// high gain.
+/// A loop has diverged if its output exceeds this multiple of its first value. Transients may be large, as after a wrong first
+/// guess at a high gain.
 const DIVERGED: f64 = 1e6;
-/// A loop that keeps less of the continuous rate than this is told of.
+/// A loop gets a warning if it keeps less than this fraction of the continuous rate.
 const COMFORTABLE: f64 = 0.75;
 
-/// What may be claimed of one driven body: of the law in continuous time, and of the loop that runs.
+/// The convergence claim for one driven body: of the law in continuous time, and of the loop as it runs.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Claim {
     /// The driven body.
     pub body: String,
-    /// The slowest exponent of the continuous law's error, 1/s; none if the rig has no theorem for this scenario.
+    /// The slowest exponent of the continuous law's error, 1/s; `None` if the rig has no theorem for this scenario.
     pub continuous_rate_per_s: Option<f64>,
-    /// The exponent at which the error of the sampled, held and delayed loop falls once it is small, 1/s; none if no such
-    /// claim holds.
+    /// The exponent at which the error of the sampled, held and delayed loop falls once it is small, 1/s; `None` if there is no
+    /// uniform rate.
     pub loop_rate_per_s: Option<f64>,
-    /// The stretch of the motion, from its start, over which the rate and the floors were computed, s; none without a rate.
+    /// The time from the start over which the rate and the floors were computed, s; `None` without a rate.
     pub over_s: Option<f64>,
-    /// Why none is claimed.
+    /// The reason why there is no loop rate.
     pub reason: Option<String>,
     /// The first of `floors`.
     pub floor: Option<f64>,
-    /// Per metric: below this its error does not stay, for the quadrature at this tick, rounding, the sensors' noise and bias,
-    /// and the bodies' differences.
+    /// Per metric, the level below which its error does not stay, due to quadrature at this tick, rounding, sensor noise and bias,
+    /// and differences between the bodies.
     pub floors: Vec<Figure>,
-    /// When the limits in `[accept]` are reached at that rate.
+    /// The times at which the limits in `[accept]` are reached at that rate.
     pub reaches: Vec<Reach>,
-    /// The conditions on the continuous law, and those of stability.
+    /// The conditions on the continuous law and on stability.
     pub conditions: Vec<ConditionReport>,
-    /// What the conditions rest on.
+    /// The bounds on which the conditions rest.
     pub bounds: Vec<Figure>,
-    /// What a careful engineer would change.
+    /// Advice on settings to change.
     pub warnings: Vec<String>,
 }
 
-/// When a metric reaches its limit.
+/// The time at which a metric reaches its limit.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Reach {
     /// The metric.
     pub metric: String,
     /// Its limit in `[accept]`.
     pub limit: f64,
-    /// What it is at the start.
+    /// The value at the start.
     #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub from: f64,
-    /// How long a fall from there takes at the loop's rate, s; none if the limit is below the floor.
+    /// The time from the start to the limit at the loop's rate, s; `None` if the limit is below the floor.
     pub after_s: Option<f64>,
 }
 
-/// The same for a rig whose type is known.
+/// Computes the claims of a rig, one per driven body.
 pub(crate) fn of_rig<R: Rig>(rig: &R, scenario: &Settings) -> Vec<Claim> {
     let driven = rig.bodies().iter().enumerate().filter(|(_, body)| body.driven);
     let certificates = rig.certificates();
@@ -132,7 +132,7 @@ impl<R: Rig> Analysis<'_, R> {
         named.map(|(name, value)| Figure { name: name.to_owned(), value: *value }).collect()
     }
 
-    /// When each limit of the scenario is reached, from its error at the start.
+    /// Computes when each limit of the scenario is reached, from the error at its start.
     fn reaches(&self, rate_per_s: f64, floors: &[f64]) -> Vec<Reach> {
         let Some(rig) = self.rig.isolated(self.index, Start::Given, false) else {
             return Vec::new();
@@ -151,15 +151,15 @@ impl<R: Rig> Analysis<'_, R> {
         limited.filter_map(reach).collect()
     }
 
-    /// Returns the ticks after whose first three quarters an error that falls at this rate has settled; at least those of the
-    /// scenario, up to [`SCENARIO_TICKS_MAX`].
+    /// Returns the ticks to examine, so that an error that falls at this rate has settled after three quarters of them; at least
+    /// those of the scenario, up to [`SCENARIO_TICKS_MAX`].
     fn ticks_to_settle(&self, rate_per_s: f64) -> u64 {
         let ticks = SETTLED / (rate_per_s.max(0.0) * self.tick_s);
         (ticks.min(TICKS_MAX as f64) as u64)
             .clamp(self.scenario.last_tick.clamp(TICKS_MIN, SCENARIO_TICKS_MAX), TICKS_MAX)
     }
 
-    /// The largest error per metric of a loop that was synchronised from the start, with all that disturbs it.
+    /// Computes the largest error per metric of a loop that is synchronised from the start, with all disturbances.
     fn floors(&self, ticks: u64) -> Vec<f64> {
         let mut floors = vec![0.0; self.rig.metrics().len()];
         let mut values = floors.clone();
@@ -181,8 +181,8 @@ impl<R: Rig> Analysis<'_, R> {
         floors
     }
 
-    /// Whether the scenario's own start leads where the rate speaks of. Where rounding alone is left, one that does may end at
-    /// another floor than the settled loop; `floors` become its own.
+    /// Checks that the loop synchronises from the scenario's own start, at the given rate. If only rounding is left, it may reach
+    /// another floor than the settled loop; `floors` then become its own.
     fn arrives(&self, rate_per_s: f64, floors: &mut [f64]) -> Result<(), String> {
         let Some(rig) = self.rig.isolated(self.index, Start::Given, true) else {
             return Ok(());
@@ -190,7 +190,7 @@ impl<R: Rig> Analysis<'_, R> {
         let (mut chain, mut guards) =
             (Chain::new(&rig, self.tick_s, self.scenario.actuation_delay_ticks), Guards::new(&rig));
         let (mut values, mut motion) = (vec![0.0; floors.len()], Vec::new());
-        // The largest errors of all, in the second quarter, and in the last.
+        // The largest errors: over all ticks, in the second quarter, and in the last.
         let (mut largest, mut halfway, mut last) = (values.clone(), values.clone(), values.clone());
         let ticks = self.ticks_to_settle(rate_per_s);
         let part = ticks / 4;
@@ -220,15 +220,15 @@ impl<R: Rig> Analysis<'_, R> {
                     digits(tick as f64 * self.tick_s)
                 ));
             }
-            let seen: &mut [f64] = match tick {
+            let maxima: &mut [f64] = match tick {
                 tick if tick >= ticks - part => &mut last,
                 tick if (ticks / 2 - part..ticks / 2).contains(&tick) => &mut halfway,
                 _ => &mut [],
             };
-            seen.iter_mut().zip(&values).for_each(|(seen, value)| *seen = value.max(*seen));
+            maxima.iter_mut().zip(&values).for_each(|(maximum, value)| *maximum = value.max(*maximum));
             largest.iter_mut().zip(&values).for_each(|(largest, value)| *largest = value.max(*largest));
         }
-        // What falls for longer than is looked at falls at this rate already.
+        // An error that falls beyond the examined ticks must already fall at this rate.
         let least = (-0.8 * rate_per_s * (ticks / 2) as f64 * self.tick_s).exp();
         let capped = SETTLED > rate_per_s * TICKS_MAX as f64 * self.tick_s;
         for (index, (last, floor)) in last.iter().zip(&mut *floors).enumerate() {
@@ -244,7 +244,7 @@ impl<R: Rig> Analysis<'_, R> {
                 *floor = *last;
             }
         }
-        // Of two modes that fall almost alike the slower one may not show before the floor, or the error be a product of both.
+        // Of two modes with similar rates, the slower may not appear above the floor, or the error may be a product of both.
         match fall.rates(floors).map(|rates| rates.map(|per_tick| per_tick / self.tick_s)) {
             Some(rates)
                 if rates.iter().all(|rate| *rate > OWN * rate_per_s)
@@ -268,7 +268,7 @@ impl Claim {
         self.loop_rate_per_s.map(|rate| to_tolerance(rate, exponent::AGREEMENT * rate))
     }
 
-    /// Adds what stands against it.
+    /// Adds the warnings that follow from rates and floors.
     fn warn(&mut self) {
         match (self.loop_rate_per_s, self.continuous_rate_per_s) {
             (None, _) => self.warnings.extend(self.reason.clone()),
@@ -331,9 +331,9 @@ mod tests {
         }
     }
 
-    /// Nothing is claimed of loops that do not converge, or whose observer is told nothing.
+    /// A loop that does not converge, or whose observer gets no information, has no rate.
     #[test]
-    fn no_rate_is_claimed_where_none_holds() {
+    fn diverging_and_unobservable_loops_have_no_rate() {
         for (overrides, reason) in [
             (
                 // Fast, and sampled at 20 Hz: every continuous condition holds.
@@ -354,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    fn a_start_that_ends_in_the_central_body_or_beyond_the_region_is_told() {
+    fn a_start_that_loses_the_body_is_a_warning_with_its_cause() {
         let text = SHIPPED.iter().find(|(name, _)| *name == "orbit-rendezvous").unwrap().1;
         for (overrides, cause) in [
             (&["tick_hz=3.0"][..], "follower meets the central body after"),

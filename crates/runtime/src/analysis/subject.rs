@@ -1,12 +1,12 @@
-//! The loop that is analysed: one driven body of a rig, and the limits within which it is looked at.
+//! The analysed loop of one driven body, and the limits of the analysis.
 
 use crate::config::Settings;
 use crate::rig::Rig;
 
-/// Ticks that are looked at, at the least and at the most.
+/// The least and the most examined ticks.
 pub(super) const TICKS_MIN: u64 = 2_000;
 pub(super) const TICKS_MAX: u64 = 256_000;
-/// A loop that was settled, and says so many times what it said then, does not stay settled.
+/// A settled loop diverges if its output exceeds this multiple of its first value.
 pub(super) const LOST: f64 = 20.0;
 
 /// The analysis of one driven body's loop.
@@ -23,7 +23,7 @@ impl<'a, R: Rig> Analysis<'a, R> {
     }
 }
 
-/// Whether a size is beyond a limit, or no number.
+/// Returns true if a size exceeds a limit or is not a number.
 pub(super) fn exceeds(size: f64, limit: f64) -> bool {
     size.is_nan() || size > limit.max(f64::MIN_POSITIVE)
 }
