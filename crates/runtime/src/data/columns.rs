@@ -1,13 +1,13 @@
-//! Which column of a log is what, and in which unit: as told, else by its name. Must not guess where two columns would do.
+//! Finds the column and the unit of each quantity: from the options, else by name. Must not guess between two candidates.
 
 use super::form::{DataError, Meaning, Options};
 use super::unit::{RateUnit, TimeUnit};
 use std::path::Path;
 
-/// What a name without its unit and its axis calls a stamp.
+/// Names of a time stamp, without unit and axis.
 const STAMPS: [&str; 9] =
     ["time", "t", "timestamp", "stamp", "seconds", "elapsed", "secondselapsed", "elapsedtime", "timesec"];
-/// What a name without its unit and its axis calls an angular velocity.
+/// Names of an angular velocity, without unit and axis.
 const RATES: [&str; 16] = [
     "w",
     // As in ax, ay, az, gx, gy, gz.
@@ -28,19 +28,19 @@ const RATES: [&str; 16] = [
     "gyroraw",
 ];
 
-/// The words of a name, in small letters.
+/// Returns the words of a name in lower case.
 fn words(name: &str) -> Vec<String> {
     let name = name.to_lowercase();
     let words = name.split(|letter: char| !letter.is_alphanumeric() && letter != '°');
     words.filter(|word| !word.is_empty()).map(str::to_owned).collect()
 }
 
-/// The unit of time that a name tells: its last word.
+/// Returns the unit of time in a name: its last word.
 fn time_unit(name: &str) -> Option<TimeUnit> {
     words(name).last().and_then(|word| TimeUnit::parse(word))
 }
 
-/// Whether a name is that of a stamp.
+/// Returns true if a name is that of a time stamp.
 fn is_stamp(name: &str) -> bool {
     let mut words = words(name);
     if words.len() > 1 && time_unit(name).is_some() {
@@ -49,18 +49,18 @@ fn is_stamp(name: &str) -> bool {
     STAMPS.contains(&words.concat().as_str())
 }
 
-/// The unit of angular velocity that a name tells.
+/// Returns the unit of angular velocity in a name.
 fn rate_unit(name: &str) -> Option<RateUnit> {
     let words = words(name);
-    let says = |unit: &[&str]| words.iter().any(|word| unit.contains(&word.as_str()));
-    match (says(&["rad", "rads", "radians"]), says(&["deg", "dps", "degrees", "°"])) {
+    let has_word = |unit: &[&str]| words.iter().any(|word| unit.contains(&word.as_str()));
+    match (has_word(&["rad", "rads", "radians"]), has_word(&["deg", "dps", "degrees", "°"])) {
         (true, false) => Some(RateUnit::RadiansPerSecond),
         (false, true) => Some(RateUnit::DegreesPerSecond),
         _ => None,
     }
 }
 
-/// The axis, 0 to 2, of which a name is the angular velocity.
+/// Returns the axis, 0 to 2, of the angular velocity with this name.
 fn rate_axis(name: &str) -> Option<usize> {
     const UNITS: [&str; 11] = ["rad", "rads", "radians", "deg", "degrees", "dps", "°", "s", "sec", "per", "second"];
     let mut words = words(name);
@@ -68,7 +68,7 @@ fn rate_axis(name: &str) -> Option<usize> {
     let last = words.pop()?;
     let axis = |letter: &str| ["x", "y", "z"].iter().position(|axis| *axis == letter);
     let index = |digit: &str| ["0", "1", "2"].iter().position(|index| *index == digit);
-    // An own word, as in `gyro_x` and `omega_rad_s[0]`, or the end of one, as in `wx`.
+    // A separate word, as in `gyro_x` and `omega_rad_s[0]`, or the end of a word, as in `wx`.
     let (stem, axis) = match axis(&last).or_else(|| index(&last)) {
         Some(axis) => (words.concat(), axis),
         None => {
@@ -79,20 +79,20 @@ fn rate_axis(name: &str) -> Option<usize> {
     RATES.contains(&stem.as_str()).then_some(axis)
 }
 
-/// Where the columns of a log are.
+/// The positions of a log's columns.
 #[derive(Debug, Clone)]
 pub struct Places {
     /// The column of stamps.
     pub time: usize,
-    /// Those of the rates, where there are any.
+    /// The columns of the rates; `None` for a missing one.
     pub rates: [Option<usize>; 3],
-    /// The one that segments are told by.
+    /// The column that separates segments.
     pub by: Option<usize>,
-    /// What they mean.
+    /// The names and units of the columns.
     pub meaning: Meaning,
 }
 
-/// Finds the columns by their names.
+/// Finds the columns by the options and their names.
 pub fn find(names: &[String], path: &Path, options: &Options) -> Result<Places, DataError> {
     let refuse = |reason: String, remedy: &str| {
         let columns = names.iter().take(40).map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
@@ -102,12 +102,12 @@ pub fn find(names: &[String], path: &Path, options: &Options) -> Result<Places, 
     let named = |wanted: &str| {
         let found: Vec<usize> = (0..names.len()).filter(|index| names[*index] == wanted).collect();
         match found[..] {
-            [one] => Ok(one),
+            [index] => Ok(index),
             [] => Err(refuse(format!("there is no column `{wanted}`"), "name one that there is")),
             _ => Err(refuse(format!("{} columns are called `{wanted}`", found.len()), "rename all but one")),
         }
     };
-    // A file without header has numbers for names.
+    // In a file without header the names are numbers.
     let numbers = names.iter().all(|name| name.parse::<f64>().is_ok());
     let unnamed =
         if options.header && numbers { "; if it has no header say so, and give columns by number" } else { "" };
@@ -116,7 +116,7 @@ pub fn find(names: &[String], path: &Path, options: &Options) -> Result<Places, 
         None => {
             let found: Vec<usize> = (0..names.len()).filter(|index| is_stamp(&names[*index])).collect();
             match found[..] {
-                [one] => one,
+                [index] => index,
                 _ => {
                     let count = if found.is_empty() { "no column is" } else { "more than one column is" };
                     let remedy = format!("name the column of time{unnamed}");
@@ -139,7 +139,7 @@ pub fn find(names: &[String], path: &Path, options: &Options) -> Result<Places, 
                 let found: Vec<usize> = (0..names.len()).filter(|i| rate_axis(&names[*i]) == Some(axis)).collect();
                 *rate = match found[..] {
                     [] => None,
-                    [one] => Some(one),
+                    [index] => Some(index),
                     _ => {
                         let both = format!("`{}` and `{}`", names[found[0]], names[found[1]]);
                         return Err(refuse(
@@ -164,9 +164,9 @@ pub fn find(names: &[String], path: &Path, options: &Options) -> Result<Places, 
         return Err(refuse(format!("`{}` is named twice", names[twice]), "name each column once"));
     }
     let by = options.by.as_deref().map(named).transpose()?;
-    let told_time = options.time_unit.or_else(|| time_unit(&names[time]));
+    let given_time = options.time_unit.or_else(|| time_unit(&names[time]));
     let units: Vec<_> = rates.iter().flatten().map(|index| rate_unit(&names[*index])).collect();
-    let told_rate = match (options.rate_unit, units.first()) {
+    let given_rate = match (options.rate_unit, units.first()) {
         (Some(unit), _) => Some(unit),
         (None, Some(first)) if units.iter().all(|unit| unit == first) => *first,
         _ => {
@@ -175,11 +175,11 @@ pub fn find(names: &[String], path: &Path, options: &Options) -> Result<Places, 
     };
     let name = |index: Option<usize>| index.map_or_else(|| "-".to_owned(), |index| names[index].clone());
     let mut assumed = Vec::new();
-    assumed.extend(told_time.is_none().then_some("time"));
-    assumed.extend(told_rate.is_none().then_some("rate"));
+    assumed.extend(given_time.is_none().then_some("time"));
+    assumed.extend(given_rate.is_none().then_some("rate"));
     let meaning = Meaning {
-        time: (name(Some(time)), told_time.unwrap_or(TimeUnit::Seconds)),
-        rates: (rates.map(name), told_rate.unwrap_or(RateUnit::RadiansPerSecond)),
+        time: (name(Some(time)), given_time.unwrap_or(TimeUnit::Seconds)),
+        rates: (rates.map(name), given_rate.unwrap_or(RateUnit::RadiansPerSecond)),
         assumed,
     };
     Ok(Places { time, rates, by, meaning })

@@ -1,4 +1,4 @@
-//! Rows of a CSV file, or of what looks like one. Must not hold more of it than a line.
+//! Reads rows of CSV. Must not hold more than one line in memory.
 
 use super::columns::{self, Places};
 use super::form::{DataError, Meaning, Options, Row, Rows};
@@ -7,19 +7,19 @@ use csv::{ByteRecord, ErrorKind, Reader, ReaderBuilder, Trim};
 use std::io::{self, Cursor, Read};
 use std::path::{Path, PathBuf};
 
-/// No line of a log is longer, bytes.
+/// The longest line, bytes.
 const LINE_BYTES: usize = 1 << 20;
-/// So much is looked at to learn what parts the cells, bytes.
+/// The part of the file in which the delimiter is detected, bytes.
 const PEEK_BYTES: usize = 64 << 10;
-/// So much of a cell is shown in a message, letters.
+/// The longest part of a cell shown in a message, characters.
 const SHOWN_LETTERS: usize = 40;
-/// Why a line is refused before it is read to its end.
+/// The reason for refusing a line that is too long.
 const TOO_LONG: &str = "a line is longer than 1 MiB; name a CSV file";
 
-/// A CSV file that is being read.
+/// A reader of a CSV file.
 pub struct Csv {
     lines: Lines,
-    /// Whether the record at hand is the next row already: the first one of a file without header.
+    /// True while the current record is still to be read as a row: the first one of a file without header.
     waiting: bool,
     cells: usize,
     places: Places,
@@ -46,7 +46,7 @@ impl Csv {
             return Err(form("the file is no text; name a CSV file"));
         }
         if start.starts_with(b"\xef\xbb\xbf") {
-            // The mark of UTF-8 belongs to no line.
+            // The byte order mark is not part of the first line.
             start.drain(..3);
         }
         let delimiter = delimiter(&start);
@@ -70,7 +70,7 @@ impl Csv {
 }
 
 impl Lines {
-    /// Reads the next record; false at the end.
+    /// Reads the next record; returns false at the end.
     fn read(&mut self) -> Result<bool, DataError> {
         self.reader.read_byte_record(&mut self.record).map_err(|error| {
             let (path, line) = (self.path.clone(), self.reader.position().line());
@@ -84,13 +84,13 @@ impl Lines {
         })
     }
 
-    /// Where the record at hand begins: its own position is before the empty lines and comments that were passed over.
+    /// Returns the line on which the current record begins. The record's own position would be before skipped lines and comments.
     fn line(&self) -> u64 {
-        let own = self.record.as_slice().iter().filter(|byte| **byte == b'\n').count() as u64;
-        self.reader.position().line().saturating_sub(1 + own)
+        let line_ends = self.record.as_slice().iter().filter(|byte| **byte == b'\n').count() as u64;
+        self.reader.position().line().saturating_sub(1 + line_ends)
     }
 
-    /// A cell of the record at hand, which has it.
+    /// Returns a cell of the current record.
     fn cell(&self, column: usize) -> &[u8] {
         self.record.get(column).unwrap_or_default()
     }
@@ -103,7 +103,7 @@ impl Lines {
         DataError::Cell { path, line: self.line(), column, text, reason }
     }
 
-    /// A number, or none where it is not known.
+    /// Reads a number; `None` if it is unknown.
     fn number(&self, column: usize, name: &str) -> Result<Option<f64>, DataError> {
         let cell = self.cell(column);
         if let Some(value) = std::str::from_utf8(cell).ok().and_then(|text| text.parse::<f64>().ok()) {
@@ -126,7 +126,7 @@ impl Lines {
         }
     }
 
-    /// A stamp, or none where it is not known.
+    /// Reads a stamp; `None` if it is unknown.
     fn stamp(&self, column: usize, meaning: &Meaning) -> Result<Option<Stamp>, DataError> {
         let (name, unit) = &meaning.time;
         if let Some(stamp) = std::str::from_utf8(self.cell(column)).ok().and_then(|text| Stamp::digits(text, *unit)) {
@@ -169,28 +169,28 @@ impl Rows for Csv {
     }
 }
 
-/// What parts the cells: of comma, semicolon and tab what the first line that is no comment has most of.
+/// Detects the delimiter: the most frequent of comma, semicolon and tab in the first line other than a comment.
 fn delimiter(start: &[u8]) -> u8 {
     let mut lines = start.split(|byte| matches!(byte, b'\n' | b'\r'));
     let first = lines.find(|line| !line.is_empty() && line[0] != b'#').unwrap_or_default();
     let count = |delimiter: &u8| first.iter().filter(|byte| *byte == delimiter).count();
-    // Of equally many the last one is taken.
+    // Among equal counts, `max_by_key` takes the last.
     [b'\t', b';', b','].into_iter().max_by_key(count).unwrap_or(b',')
 }
 
-/// Whether a cell is a number but for a comma in the place of the point.
+/// Returns true if a cell is a number with a decimal comma.
 fn is_decimal_comma(cell: &[u8]) -> bool {
     let text = String::from_utf8_lossy(cell);
     text.matches(',').count() == 1 && text.replace(',', ".").parse::<f64>().is_ok()
 }
 
-/// Gives every line the end `\n`, the last one too, and lets lines through up to a length: what has no ends of lines is not to
-/// be held in memory.
+/// A reader that ends every line with `\n`, including the last, and refuses lines that are too long: a source without line ends
+/// must not fill the memory.
 struct LineEnds<R> {
     source: R,
-    /// The bytes since the last end of a line.
+    /// The bytes since the last line end.
     length: usize,
-    /// Whether the last byte was a carriage return, which has become an end already.
+    /// True if the last byte was a carriage return, which has already become a line end.
     returned: bool,
 }
 
@@ -207,7 +207,7 @@ impl<R: Read> Read for LineEnds<R> {
             if self.length > LINE_BYTES {
                 return Err(io::Error::new(io::ErrorKind::InvalidData, TOO_LONG));
             }
-            // Nothing is left of a lone end of a line that was begun.
+            // No byte is left if the buffer held only the `\n` of a `\r\n`.
             if count > 0 {
                 return Ok(count);
             }
@@ -216,7 +216,7 @@ impl<R: Read> Read for LineEnds<R> {
 }
 
 impl<R> LineEnds<R> {
-    /// The end of a last line that has none.
+    /// Adds the line end that the last line lacks; returns the number of bytes added.
     fn last_end(&mut self, buffer: &mut [u8]) -> usize {
         match buffer.first_mut() {
             Some(first) if self.length > 0 => {
@@ -227,7 +227,7 @@ impl<R> LineEnds<R> {
         }
     }
 
-    /// Makes `\r\n` and `\r` ends as the others are; returns how many bytes are left.
+    /// Replaces `\r\n` and `\r` with `\n`; returns the number of bytes left.
     fn normalise(&mut self, bytes: &mut [u8]) -> usize {
         if !self.returned && !bytes.contains(&b'\r') {
             return bytes.len();

@@ -1,6 +1,6 @@
-//! A log's hidden component, row by row: rotation into principal axes, the choice of a rate, the reconstruction, its score.
+//! Estimates a log's hidden component row by row: rotates into principal axes, chooses a rate, reconstructs, and scores.
 //!
-//! So many samples are read ahead as a rate is chosen from; beyond that, memory grows with the number of segments only.
+//! It reads ahead the samples from which it chooses the rate; beyond that, memory grows only with the number of segments.
 
 use super::form::{DataError, Options};
 use super::identification::{LogAccount, sample};
@@ -12,17 +12,17 @@ use crate::identify::Sample;
 use nalgebra::{Matrix3, Vector3};
 use std::path::Path;
 
-/// A rate is chosen from at most so many samples.
+/// The most samples from which a rate is chosen.
 const SURVEY_SAMPLES: usize = 100_000;
-/// Rates of so many times their noise tell something.
+/// Rates above this multiple of their noise carry information.
 const FLOOR_NOISES: f64 = 10.0;
 const LEAST_FLOOR_RAD_S: f64 = 1e-6;
-/// A part of a rotation that is smaller mixes nothing.
+/// Smaller entries of a rotation count as zero.
 const UNMIXED: f64 = 1e-9;
-/// How far a rotation may be from one.
+/// The largest deviation of a rotation matrix from orthogonality.
 const ROTATION: f64 = 1e-3;
 
-/// Which filter is asked for.
+/// The kind of filter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum FilterOrder {
     /// The papers' filter of first order.
@@ -34,7 +34,7 @@ pub enum FilterOrder {
     Kalman,
 }
 
-/// What is asked for.
+/// The settings of an estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Request {
     /// The hidden axis, 1 to 3, among the principal ones.
@@ -43,21 +43,21 @@ pub struct Request {
     pub coefficients: Vector3<f64>,
     /// Damping by a torque −c I ω, 1/s.
     pub damping_per_s: f64,
-    /// The principal axes as columns in the sensor's axes; none where these are the same.
+    /// The principal axes as columns in the sensor's axes; `None` if both are the same.
     pub axes: Option<Matrix3<f64>>,
     /// The filter.
     pub order: FilterOrder,
-    /// Its rate, 1/s; chosen from the log's start if none is given.
+    /// The rate of the filter, 1/s; chosen from the log's start if `None`.
     pub decay_per_s: Option<f64>,
-    /// Standard deviation of one measured rate, rad/s; that of the log's start if none is given. Only the Kalman filter asks.
+    /// Standard deviation of one measured rate, rad/s; that of the log's start if `None`. Only the Kalman filter uses it.
     pub noise_rad_s: Option<f64>,
     /// The first estimate of every segment, rad/s.
     pub guess_rad_s: Option<f64>,
-    /// Below this the measured rates carry no information, rad/s; ten times the noise of the log's start if none is given.
+    /// The level below which the measured rates carry no information, rad/s; ten times the noise of the log's start if `None`.
     pub floor_rad_s: Option<f64>,
 }
 
-/// Why there is no estimate.
+/// An error of an estimate.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum EstimateError {
@@ -65,11 +65,11 @@ pub enum EstimateError {
     #[error(transparent)]
     #[strum(transparent)]
     Data(#[from] DataError),
-    /// What was asked for is impossible.
+    /// The settings are impossible.
     #[error(transparent)]
     #[strum(serialize = "impossible-estimate")]
     Setup(#[from] ReconstructionError),
-    /// The axes are none.
+    /// The axes are not a rotation.
     #[error(
         "the axes are no rotation: their columns must be of length 1, at right angles, and right-handed; take them from \
          `corotate identify --json`"
@@ -92,7 +92,7 @@ pub enum EstimateError {
         /// The log.
         path: String,
     },
-    /// Somebody who was given the rows failed.
+    /// The receiver of the rows failed.
     #[error(transparent)]
     #[strum(serialize = "cannot-write")]
     Sink(std::io::Error),
@@ -103,24 +103,24 @@ pub enum EstimateError {
 pub struct Estimated {
     /// The row.
     pub entry: Entry,
-    /// The angular velocity about the principal axes, rad/s; not a number where it was not measured.
+    /// The angular velocity about the principal axes, rad/s; NaN where it was not measured.
     pub principal_rad_s: Vector3<f64>,
-    /// The hidden component.
+    /// The reconstructed hidden component.
     pub told: Reconstructed,
 }
 
-/// What became of a log.
+/// The result for a log.
 #[derive(Debug, Clone)]
 pub struct Estimation {
     /// The log.
     pub log: LogAccount,
-    /// What was used.
+    /// The filter that was used.
     pub filter: FilterKind,
-    /// Below this the measured rates counted as telling nothing, rad/s.
+    /// The level below which the measured rates counted as carrying no information, rad/s.
     pub floor_rad_s: f64,
-    /// How its rate was chosen, if it was, and what of the log it was chosen by.
+    /// The rate choice from the log's start, if one was possible, with the data that it rests on.
     pub choice: Option<RateChoice>,
-    /// Whether the rate is the chosen one.
+    /// True if the filter uses the chosen rate.
     pub chosen: bool,
     /// The segments with their names and scores, in the order of the log.
     pub segments: Vec<(String, SegmentScore)>,
@@ -142,8 +142,8 @@ pub fn estimate_log(
         return Err(EstimateError::Axes);
     }
     let hidden = request.axis.wrapping_sub(1);
-    // Which sensors the two rates about the other principal axes are made of.
-    let needed = [0, 1, 2].map(|sensor| (0..3).any(|own| own != hidden && axes[(sensor, own)].abs() > UNMIXED));
+    // The sensors that contribute to the two rates about the other principal axes.
+    let needed = [0, 1, 2].map(|sensor| (0..3).any(|axis| axis != hidden && axes[(sensor, axis)].abs() > UNMIXED));
     let options = Options { needed, ..options.clone() };
     let absent = |sensor: &usize| options.rates.as_ref().is_some_and(|names| names[*sensor] == "-");
     if let Some(sensor) = (0..3).filter(|sensor| needed[*sensor]).find(absent).filter(|_| request.axes.is_some()) {
@@ -155,9 +155,9 @@ pub fn estimate_log(
         if request.axes.is_none() {
             return measured;
         }
-        // A rate that is not known does not spoil those that have no part of it.
-        Vector3::from_fn(|own, _| {
-            let parts = (0..3).map(|sensor| (axes[(sensor, own)], measured[sensor]));
+        // An unknown rate does not affect rates to which it does not contribute.
+        Vector3::from_fn(|axis, _| {
+            let parts = (0..3).map(|sensor| (axes[(sensor, axis)], measured[sensor]));
             parts.filter(|(part, _)| part.abs() > UNMIXED).map(|(part, rate)| part * rate).sum()
         })
     };
@@ -182,9 +182,9 @@ pub fn estimate_log(
             named.clone_into(&mut name);
         }
         let principal_rad_s = principal(entry);
-        let told = reconstruction.push(&Sample { time_s: entry.time_s, rate_rad_s: principal_rad_s });
-        score.push(told.rate_rad_s, principal_rad_s[hidden], told.observed);
-        each(&Estimated { entry: *entry, principal_rad_s, told }, &name).map_err(EstimateError::Sink)
+        let reconstructed = reconstruction.push(&Sample { time_s: entry.time_s, rate_rad_s: principal_rad_s });
+        score.push(reconstructed.rate_rad_s, principal_rad_s[hidden], reconstructed.observed);
+        each(&Estimated { entry: *entry, principal_rad_s, told: reconstructed }, &name).map_err(EstimateError::Sink)
     };
     let mut names = String::new();
     for (entry, named) in &head {
@@ -205,7 +205,7 @@ pub fn estimate_log(
     Ok(Estimation { log: account, filter, floor_rad_s, choice, chosen: request.decay_per_s.is_none(), segments })
 }
 
-/// Reads a log's start, with the name of every segment that begins there.
+/// Reads a log's start, with the name of each segment that begins there.
 #[allow(clippy::type_complexity, reason = "it is taken apart at once")]
 fn survey(
     log: &mut Log,
@@ -224,7 +224,7 @@ fn survey(
     Ok((head, survey))
 }
 
-/// The filter that was asked for, its rate and its noise those of the log's start where none are given.
+/// Returns the requested filter; a missing rate or noise is that of the log's start.
 fn filter(request: &Request, choice: Option<&RateChoice>, path: &Path) -> Result<FilterKind, EstimateError> {
     let none = || EstimateError::NoRate { path: path.display().to_string() };
     let decay_per_s = match (request.decay_per_s, choice) {
@@ -237,7 +237,7 @@ fn filter(request: &Request, choice: Option<&RateChoice>, path: &Path) -> Result
         FilterOrder::Second => FilterKind::Second { bandwidth_rad_s: decay_per_s },
         FilterOrder::Kalman => {
             let choice = choice.ok_or_else(none)?;
-            // A log without noise has its rounding.
+            // A log without noise still has rounding.
             let rounding = f64::EPSILON * choice.fastest_rad_s;
             let noise_rad_s = request.noise_rad_s.unwrap_or(choice.noise_rad_s.max(rounding));
             let density = choice.density(decay_per_s, noise_rad_s);

@@ -1,11 +1,11 @@
-//! What is told of a log beforehand, what a form of file gives of it, and why it cannot be read.
+//! Options of a log, the rows that a file format yields, and the errors of reading.
 
 use super::stamp::Stamp;
 use super::unit::{RateUnit, TimeUnit};
 use std::io;
 use std::path::PathBuf;
 
-/// What is known of a log beforehand. All that is not given is taken from the names of its columns.
+/// Options for reading a log. Columns and units that are not given follow from the names of the columns.
 ///
 /// ```
 /// # extern crate corotate_runtime as corotate;
@@ -27,11 +27,11 @@ use std::path::PathBuf;
 /// ```
 #[derive(Debug, Clone)]
 pub struct Options {
-    /// The topic of an MCAP file, or the end of its name. Such a file needs none of the other names and units.
+    /// The topic of an MCAP file, or the end of its name. MCAP needs no column names or units.
     pub topic: Option<String>,
-    /// The column of time stamps, by name, or by number from 1 where there is no header.
+    /// The column of time stamps, by name, or by number from 1 without a header.
     pub time: Option<String>,
-    /// The columns of the three rates; a `-` stands for one that the log does not have.
+    /// The columns of the three rates; `-` for a missing one.
     pub rates: Option<[String; 3]>,
     /// The unit of the stamps.
     pub time_unit: Option<TimeUnit>,
@@ -41,9 +41,9 @@ pub struct Options {
     pub by: Option<String>,
     /// A longer pause begins a new segment, s.
     pub gap_s: Option<f64>,
-    /// Whether the first row has names.
+    /// True if the first row holds the column names.
     pub header: bool,
-    /// Rows that lack one of these rates are left out.
+    /// The rates that a row must have; other rows are left out.
     pub needed: [bool; 3],
 }
 
@@ -63,11 +63,11 @@ impl Default for Options {
     }
 }
 
-/// Why a log cannot be read.
+/// An error while reading a log.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum DataError {
-    /// The system says no.
+    /// The system cannot read the file.
     #[error("cannot read {}: {source}; name a file that can be read", path.display())]
     #[strum(serialize = "cannot-read")]
     Read {
@@ -76,27 +76,27 @@ pub enum DataError {
         /// The system's reason.
         source: io::Error,
     },
-    /// There is not one row of numbers.
+    /// The log has no row of numbers.
     #[error("{}: it has no row of numbers; give it at least one below its header", path.display())]
     #[strum(serialize = "no-rows")]
     Empty {
         /// The file.
         path: PathBuf,
     },
-    /// A column is not there, or it is not clear which one is meant.
+    /// A column is missing or ambiguous.
     #[error("{}: {reason}; {remedy}. Its columns: {columns}", path.display())]
     #[strum(serialize = "no-such-column")]
     Column {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The mistake.
         reason: String,
-        /// What to do.
+        /// The remedy.
         remedy: String,
-        /// The columns that there are.
+        /// The columns of the log.
         columns: String,
     },
-    /// What stands in a cell is no number.
+    /// A cell does not hold a valid number.
     #[error("{}:{line}: column {column}: `{text}` {reason}", path.display())]
     #[strum(serialize = "not-a-number")]
     Cell {
@@ -106,12 +106,12 @@ pub enum DataError {
         line: u64,
         /// The column's name.
         column: String,
-        /// What stands there.
+        /// The text of the cell.
         text: String,
-        /// Why it is none, and what to do.
+        /// The mistake, and the remedy.
         reason: String,
     },
-    /// A row has more or fewer cells than the others.
+    /// A row has more or fewer cells than the first.
     #[error(
         "{}:{line}: the row has {found} cells, the first one has {expected}; mend it, or if its numbers have a decimal comma \
          write them with a point", path.display()
@@ -122,12 +122,12 @@ pub enum DataError {
         path: PathBuf,
         /// The line, from 1.
         line: u64,
-        /// How many it has.
+        /// The number of cells in the row.
         found: usize,
-        /// How many it should have.
+        /// The number of cells in the first row.
         expected: usize,
     },
-    /// The file is no text of lines.
+    /// The file does not have a known format.
     #[error("{}:{line}: {reason}", path.display())]
     #[strum(serialize = "not-a-log")]
     Form {
@@ -135,10 +135,10 @@ pub enum DataError {
         path: PathBuf,
         /// The line, from 1.
         line: u64,
-        /// What is wrong, and what to do.
+        /// The mistake, and the remedy.
         reason: String,
     },
-    /// The unit was assumed, and cannot be right.
+    /// The assumed unit of time gives an implausible interval.
     #[error(
         "{}: the usual interval is {interval_s} s if the stamps are in {unit}, as assumed; say what they are in with a unit of \
          time (s, ms, us, ns)", path.display()
@@ -147,49 +147,49 @@ pub enum DataError {
     Unit {
         /// The file.
         path: PathBuf,
-        /// The usual interval.
+        /// The usual interval, s.
         interval_s: f64,
-        /// The unit that was assumed.
+        /// The assumed unit.
         unit: TimeUnit,
     },
-    /// An option is no possible one.
+    /// An option has an invalid value.
     #[error("{name}: {reason}")]
     #[strum(serialize = "impossible-option")]
     Option {
         /// The option.
         name: &'static str,
-        /// What is wrong, and what to do.
+        /// The mistake, and the remedy.
         reason: String,
     },
 }
 
-/// What was made of the names of a log's columns.
+/// The columns of a log with their units.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Meaning {
-    /// The column of time, and its unit.
+    /// The column of time stamps and its unit.
     pub time: (String, TimeUnit),
-    /// The columns of the rates, and their unit; a `-` for one that is not there.
+    /// The columns of the rates and their unit; `-` for a missing one.
     pub rates: ([String; 3], RateUnit),
-    /// The units that no name and no option told.
+    /// The units that were assumed, because neither a name nor an option gives them.
     pub assumed: Vec<&'static str>,
 }
 
-/// One row as the file has it, but in SI units.
+/// One row of the file, in SI units.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Row {
     pub number: u64,
-    /// None in a row without time.
+    /// `None` if the row has no time.
     pub stamp: Option<Stamp>,
     pub rate_rad_s: [f64; 3],
-    /// What stands in the column that segments are told by.
+    /// The value in the column that separates segments.
     pub key: Vec<u8>,
 }
 
-/// A form of file.
+/// A reader of one file format.
 pub(super) trait Rows {
-    /// Reads the next row into `row`; false at the end.
+    /// Reads the next row into `row`; returns false at the end.
     fn read(&mut self, row: &mut Row) -> Result<bool, DataError>;
 
-    /// What its columns mean.
+    /// Returns the meaning of the columns.
     fn meaning(&self) -> &Meaning;
 }

@@ -1,4 +1,4 @@
-//! Logs identified: every way of [`identify`](crate::identify) along the rows of files, in bounded memory.
+//! Identifies a body from logs: runs every method of [`identify`](crate::identify) along the rows, in bounded memory.
 
 use super::form::{DataError, Meaning, Options};
 use super::log::{Counts, Entry, Log};
@@ -8,12 +8,12 @@ use crate::identify::{
 };
 use std::path::{Path, PathBuf};
 
-/// How logs shall be identified.
+/// The settings of an identification.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ways {
-    /// Whether the torque of the air is part of the fit.
+    /// True if the fit includes the torque of the air.
     pub damping: bool,
-    /// The recursive identifiers' decay rate per unit of excitation; without one they forget nothing.
+    /// The recursive identifiers' decay rate per unit of excitation; `None` to forget nothing.
     pub decay: Option<f64>,
     /// The axis of symmetry, 1 to 3, if the body is known to have one.
     pub symmetry_axis: Option<usize>,
@@ -22,24 +22,24 @@ pub struct Ways {
 /// A log that was read.
 #[derive(Debug, Clone)]
 pub struct LogAccount {
-    /// Its name.
+    /// The path of the log, or its name.
     pub path: PathBuf,
-    /// What its columns mean.
+    /// The columns with their units.
     pub meaning: Meaning,
-    /// What became of its rows.
+    /// The counts of its rows.
     pub counts: Counts,
 }
 
-/// What logs say of a body.
+/// The result of an identification.
 #[derive(Debug, Clone)]
 pub struct Identified {
     /// The logs.
     pub logs: Vec<LogAccount>,
-    /// What they amount to.
+    /// A summary of the motion in the logs.
     pub account: MotionSummary,
-    /// Least squares about the sensor's axes, each axis by itself.
+    /// Least squares about the sensor's axes, each axis separately.
     pub axes: Option<AxesFit>,
-    /// Least squares about the sensor's axes, of one body.
+    /// Least squares about the sensor's axes, for one rigid body.
     pub body: Option<TensorFit>,
     /// Least squares of the whole tensor.
     pub tensor: Option<TensorFit>,
@@ -47,14 +47,14 @@ pub struct Identified {
     pub recursive: RecursiveFit<3>,
     /// The papers' filter for an axisymmetric body.
     pub axisymmetric: Option<RecursiveFit<1>>,
-    /// The damping that the recursive filters took as known, 1/s.
+    /// The damping assumed by the recursive filters, 1/s.
     pub recursive_damping_per_s: f64,
-    /// What is to be known of all this.
+    /// Findings about the quality of the result.
     pub findings: Vec<Finding>,
 }
 
-/// Reads logs of one body and identifies it. Files are read twice, the second time by the recursive filters, which take the
-/// damping from the least squares; what can be read but once (`-`) they take as not damped.
+/// Reads logs of one body and identifies it. Files are read twice: the recursive filters run second, with the damping from the
+/// least squares. A source that can be read only once (`-`) counts as undamped for them.
 ///
 /// # Errors
 /// [`DataError`].
@@ -139,14 +139,14 @@ impl Filters {
     }
 }
 
-/// What comes along a log.
+/// An event along a log.
 enum Step<'a> {
     Sample(&'a Sample),
     /// A segment ends.
     End,
 }
 
-/// A row as a sample.
+/// Returns a row as a sample.
 pub(super) fn sample(entry: &Entry) -> Sample {
     Sample { time_s: entry.time_s, rate_rad_s: entry.rate_rad_s.into() }
 }

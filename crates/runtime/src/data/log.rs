@@ -1,4 +1,4 @@
-//! A log, read row by row: which form of file it is, what is left out, and where a segment begins.
+//! Reads a log row by row: detects the file format, leaves out unusable rows, and splits it into segments.
 
 use super::form::{DataError, Meaning, Options, Row, Rows};
 #[cfg(feature = "parquet")]
@@ -11,60 +11,60 @@ use std::fs::File;
 use std::io::{self, Read, Seek};
 use std::path::{Path, PathBuf};
 
-/// So many rows are read ahead to learn the usual interval.
+/// The number of rows read ahead to find the usual interval.
 const HEAD_ROWS: usize = 256;
-/// A pause of so many usual intervals is a gap, unless told otherwise.
+/// A pause longer than this multiple of the usual interval is a gap, unless `gap_s` is given.
 const GAP_INTERVALS: f64 = 5.0;
-/// A usual interval longer than this, or shorter than its inverse in ms, hints at another unit of time, s.
+/// The longest plausible usual interval, s. One above it, or below its inverse in ms, suggests another unit of time.
 const LONGEST_INTERVAL_S: f64 = 100.0;
 
 /// A row of a log.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Entry {
-    /// Where it stands in the file: its line, or its number where there are no lines; from 1.
+    /// The line in the file, or the row number in a file without lines; from 1.
     pub row: u64,
-    /// The number of its segment, from 0.
+    /// The number of the segment, from 0.
     pub segment: u64,
-    /// Whether it is the first of its segment.
+    /// True for the first row of a segment.
     pub begins: bool,
-    /// Since the log's first row, s.
+    /// The time since the log's first row, s.
     pub time_s: f64,
-    /// The angular velocity, rad/s; not a number where it is not known.
+    /// The angular velocity, rad/s; NaN where unknown.
     pub rate_rad_s: [f64; 3],
 }
 
-/// What became of a log's rows.
+/// The counts of a log's rows, and its intervals.
 #[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
 pub struct Counts {
-    /// The rows that were read.
+    /// Rows read.
     pub rows: u64,
-    /// Those that were used.
+    /// Rows used.
     pub used: u64,
-    /// Those that lack a value that is needed; left out.
+    /// Rows left out because a needed value is missing.
     pub incomplete: u64,
-    /// Those with the stamp of the row before; left out.
+    /// Rows left out because they repeat the previous stamp.
     pub repeated: u64,
-    /// How often the stamps went back; a new segment each time.
+    /// Steps back in time; each begins a new segment.
     pub backward: u64,
-    /// How often they paused; a new segment each time.
+    /// Gaps in time; each begins a new segment.
     pub gaps: u64,
-    /// The segments.
+    /// Number of segments.
     pub segments: u64,
-    /// Shortest and longest interval within a segment, s.
+    /// The shortest and the longest interval within a segment, s.
     pub interval_s: [f64; 2],
 }
 
-/// A log, read from its beginning.
+/// A reader of a log, from its beginning to its end.
 pub struct Log {
     path: PathBuf,
     rows: Box<dyn Rows>,
     needed: [bool; 3],
     gap_s: f64,
-    /// Rows that were read ahead.
+    /// The rows read ahead.
     head: VecDeque<Row>,
     row: Row,
     first: Option<Stamp>,
-    /// The last row that was used.
+    /// The time of the last used row, s.
     last_time_s: f64,
     last_key: Vec<u8>,
     counts: Counts,
@@ -72,10 +72,10 @@ pub struct Log {
 }
 
 impl Log {
-    /// Opens a log; `-` is the standard input. What a file is is told by its first bytes: MCAP, Parquet, else CSV.
+    /// Opens a log; `-` is the standard input. The first bytes of a file give its format: MCAP, Parquet, else CSV.
     ///
     /// # Errors
-    /// [`DataError`]: from here on, and for every row.
+    /// [`DataError`], here and for every row.
     pub fn open(path: &Path, options: &Options) -> Result<Self, DataError> {
         if path.as_os_str() == "-" {
             return Self::from_csv(io::stdin(), "standard input".as_ref(), options);
@@ -107,10 +107,10 @@ impl Log {
         Self::from_csv(file, path, options)
     }
 
-    /// Reads CSV from anywhere; `path` is its name in messages.
+    /// Reads CSV from any source; `path` is its name in messages.
     ///
-    /// Cells are parted by commas, semicolons or tabs, whichever the first line has most of; lines that begin with `#` are
-    /// comments. An empty cell, or one that says NaN, NA or null, is a value that is not known.
+    /// The delimiter is comma, semicolon or tab: the most frequent one in the first line. Lines that begin with `#` are comments.
+    /// An empty cell, NaN, NA or null is an unknown value.
     ///
     /// # Errors
     /// [`DataError`].
@@ -157,27 +157,27 @@ impl Log {
         })
     }
 
-    /// Its name.
+    /// Returns the path of the log, or its name.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// What its columns mean.
+    /// Returns the meaning of the columns.
     pub fn meaning(&self) -> &Meaning {
         self.rows.meaning()
     }
 
-    /// A longer pause begins a new segment, s.
+    /// Returns the longest pause within a segment, s.
     pub fn gap_s(&self) -> f64 {
         self.gap_s
     }
 
-    /// What became of the rows so far.
+    /// Returns the counts of the rows read so far.
     pub fn counts(&self) -> &Counts {
         &self.counts
     }
 
-    /// The name of the segment that the last row belongs to: what stands in the column of `by`, or its number from 1.
+    /// Returns the name of the last row's segment: its value in the column `by`, or its number from 1.
     pub fn segment_name(&self) -> String {
         match self.last_key.is_empty() {
             true => self.counts.segments.to_string(),
@@ -185,7 +185,7 @@ impl Log {
         }
     }
 
-    /// The next row that is used; false at the end.
+    /// Returns the next used row; `None` at the end.
     fn advance(&mut self) -> Result<Option<Entry>, DataError> {
         loop {
             match self.head.pop_front() {
@@ -200,7 +200,7 @@ impl Log {
         }
     }
 
-    /// What the row that was read becomes; none if it is left out.
+    /// Counts the current row and returns its entry; `None` if it is left out.
     fn take(&mut self) -> Option<Entry> {
         let known = |(needed, rate): (&bool, &f64)| !needed || rate.is_finite();
         let complete = self.needed.iter().zip(&self.row.rate_rad_s).all(known);
@@ -210,22 +210,22 @@ impl Log {
         };
         let time_s = stamp.since_s(self.first.get_or_insert(stamp));
         let interval_s = time_s - self.last_time_s;
-        let another = self.counts.used == 0 || self.row.key != self.last_key;
-        if !another && interval_s == 0.0 {
+        let new_key = self.counts.used == 0 || self.row.key != self.last_key;
+        if !new_key && interval_s == 0.0 {
             self.counts.repeated += 1;
             return None;
         }
-        let (backward, gap) = (!another && interval_s < 0.0, !another && interval_s > self.gap_s);
+        let (backward, gap) = (!new_key && interval_s < 0.0, !new_key && interval_s > self.gap_s);
         self.counts.backward += u64::from(backward);
         self.counts.gaps += u64::from(gap);
-        let begins = another || backward || gap;
+        let begins = new_key || backward || gap;
         if begins {
             self.counts.segments += 1;
         } else {
             let [shortest, longest] = &mut self.counts.interval_s;
             (*shortest, *longest) = (shortest.min(interval_s), longest.max(interval_s));
         }
-        if another {
+        if new_key {
             self.last_key.clone_from(&self.row.key);
         }
         self.counts.used += 1;
@@ -243,13 +243,13 @@ impl Iterator for Log {
             return None;
         }
         let next = self.advance().transpose();
-        // Behind an error nothing is believed.
+        // Reading ends at the first error.
         self.done = !matches!(next, Some(Ok(_)));
         next
     }
 }
 
-/// The median of the intervals above zero, s.
+/// Returns the median of the intervals above zero, s.
 fn usual_interval_s(head: &VecDeque<Row>) -> Option<f64> {
     let pairs = head.iter().zip(head.iter().skip(1)).filter(|(last, next)| last.key == next.key);
     let interval = |(last, next): (&Row, &Row)| Some(next.stamp?.since_s(&last.stamp?));

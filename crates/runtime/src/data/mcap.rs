@@ -1,6 +1,6 @@
-//! Rows of an MCAP file: of ROS 2 `sensor_msgs/msg/Imu` messages in CDR, or of a recording of ours.
+//! Reads rows of an MCAP file: ROS 2 `sensor_msgs/msg/Imu` messages in CDR, or a recording of this program.
 //!
-//! Read from its beginning to its end, a record at a time. Must not believe a length that a message tells beyond its bytes.
+//! It reads from beginning to end, one record at a time. Must not trust a length in a message beyond the message's bytes.
 
 use super::form::{DataError, Meaning, Options, Row, Rows};
 use super::stamp::Stamp;
@@ -15,16 +15,16 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// No record of a log is longer, packed or not, bytes.
+/// The longest record, packed or not, bytes.
 const RECORD_BYTES: usize = 128 << 20;
-/// How much is read at once, if no more is asked for, bytes.
+/// The least number of bytes read at once.
 const READ_BYTES: usize = 64 << 10;
-/// What comes before the body of a CDR message, bytes.
+/// The length of the CDR header before a message's body, bytes.
 const CDR_HEADER: usize = 4;
-/// The field of our samples that is an angular velocity.
+/// The field of recorded samples that holds the angular velocity.
 const OMEGA: &str = "omega_rad_s";
 
-/// An MCAP file that is being read.
+/// A reader of an MCAP file.
 pub struct Mcap {
     path: PathBuf,
     file: File,
@@ -32,33 +32,33 @@ pub struct Mcap {
     content: Content,
 }
 
-/// What is known of the file so far.
+/// The schemas, topics and counts read so far.
 struct Content {
     topic: Option<String>,
     schemas: BTreeMap<u16, (String, Vec<u8>)>,
-    /// The topics that could be meant.
+    /// The topics with an angular velocity.
     topics: Vec<String>,
     chosen: Option<(u16, Form)>,
     messages: u64,
     meaning: Meaning,
 }
 
-/// What the messages of a topic are.
+/// The format of a topic's messages.
 #[derive(Debug, Clone, Copy)]
 enum Form {
     /// `sensor_msgs/msg/Imu`
     Imu,
-    /// A sample of ours: where its fields are, bytes from the start of the body.
+    /// A recorded sample; each field's offset from the start of the body, bytes.
     Own { omega: usize, valid: Option<usize>, generation: Option<usize> },
 }
 
 impl Mcap {
-    /// Whether a file begins as an MCAP file does.
+    /// Returns true if a file begins with the MCAP magic.
     pub fn is_begun(start: &[u8]) -> bool {
         start.starts_with(mcap::MAGIC)
     }
 
-    /// Reads nothing yet.
+    /// Creates a reader; it reads on the first row.
     pub fn new(file: File, path: &Path, options: &Options) -> Self {
         let reader = LinearReader::new_with_options(
             LinearReaderOptions::default().with_record_length_limit(RECORD_BYTES).with_prevalidate_chunk_crcs(true),
@@ -128,7 +128,7 @@ impl Rows for Mcap {
     }
 }
 
-/// What is wrong, and what to do.
+/// Returns the mistake and its remedy.
 fn words(error: &McapError) -> String {
     match error {
         McapError::UnsupportedCompression(kind) => {
@@ -144,7 +144,7 @@ fn words(error: &McapError) -> String {
 }
 
 impl Content {
-    /// Takes in a record; true if it was a message that gave a row.
+    /// Processes a record. Returns true if it was a message that gave a row.
     fn take(&mut self, record: &Record<'_>, row: &mut Row) -> Result<bool, String> {
         match record {
             Record::Schema { header, data } => {
@@ -157,7 +157,7 @@ impl Content {
                     return Ok(false);
                 }
                 self.topics.push(channel.topic.clone());
-                // The end of a topic's name will do.
+                // The end of a topic's name selects it too.
                 let wanted = self.topic.as_ref().is_none_or(|topic| {
                     let rest = channel.topic.strip_suffix(topic.as_str());
                     rest.is_some_and(|rest| rest.is_empty() || rest.ends_with('/') || topic.starts_with('/'))
@@ -195,7 +195,7 @@ impl Content {
     }
 }
 
-/// What the messages of a schema are, if there is an angular velocity in them.
+/// Returns the format of a schema's messages, if they hold an angular velocity.
 fn form(name: &str, data: &[u8]) -> Option<Form> {
     if matches!(name, "sensor_msgs/msg/Imu" | "sensor_msgs/Imu") {
         return Some(Form::Imu);
@@ -212,7 +212,7 @@ fn form(name: &str, data: &[u8]) -> Option<Form> {
 /// A stamp and three rates.
 type Decoded = (Option<Stamp>, [f64; 3]);
 
-/// A number that is finite, or one that is none.
+/// Returns the value if it is finite, else NaN.
 fn finite(value: f64) -> f64 {
     if value.is_finite() { value } else { f64::NAN }
 }
@@ -231,14 +231,14 @@ fn imu(message: &[u8]) -> Option<Decoded> {
     };
     let (seconds, nanoseconds, length) = (word(0)?.cast_signed(), word(4)?, word(8)?);
     let stamp = i64::from(seconds) * 1_000_000_000 + i64::from(nanoseconds);
-    // Numbers of 8 bytes are aligned to 8 within the body.
+    // 8-byte numbers are aligned to 8 within the body.
     let orientation = 12_usize.checked_add(length as usize)?.checked_next_multiple_of(8)?;
     let first = orientation.checked_add(8 * (4 + 9))?;
     let rates = [number(first)?, number(first + 8)?, number(first + 16)?];
     Some((Some(Stamp::whole(stamp, TimeUnit::Nanoseconds)), rates.map(finite)))
 }
 
-/// Reads a sample of ours. One that stands for none, or whose components are not valid, has no such values.
+/// Reads a recorded sample. A no-sample marker has no stamp; an invalid component has no value.
 fn own(
     message: &[u8],
     publish_time: u64,
@@ -249,7 +249,7 @@ fn own(
     let body = message.get(CDR_HEADER..)?;
     let word = |at: usize| Some(u64::from_le_bytes(body.get(at..at.checked_add(8)?)?.try_into().ok()?));
     let valid = valid.map_or(Some(u64::MAX), word)?;
-    let void = generation.map_or(Some(0), word)? & NO_SAMPLE != 0;
+    let no_sample = generation.map_or(Some(0), word)? & NO_SAMPLE != 0;
     let mut rates = [f64::NAN; 3];
     for (axis, rate) in rates.iter_mut().enumerate() {
         let value = f64::from_bits(word(omega.checked_add(8 * axis)?)?);
@@ -257,7 +257,7 @@ fn own(
             *rate = finite(value);
         }
     }
-    let stamp = i64::try_from(publish_time).ok().filter(|_| !void);
+    let stamp = i64::try_from(publish_time).ok().filter(|_| !no_sample);
     Some((stamp.map(|stamp| Stamp::whole(stamp, TimeUnit::Nanoseconds)), rates))
 }
 
@@ -325,7 +325,7 @@ mod tests {
         assert!(none.to_string().contains("is called `ata`; name one that there is"), "{none}");
     }
 
-    /// As ROS 2 writes by default, and as it does where it is told to be small.
+    /// ROS 2 writes unpacked chunks by default, and packs them on request.
     #[test]
     fn chunks_may_be_packed_or_not() {
         let directory = tempfile::tempdir().unwrap();
@@ -349,10 +349,10 @@ mod tests {
             (0..20).map(|n| (0, message(true, 1, n * 1000, "imu", [f64::from(n), 2.0, 3.0]))).collect();
         let path = file(directory.path(), &["/imu"], &messages);
         let whole = std::fs::read(&path).unwrap();
-        let other = directory.path().join("other.mcap");
+        let damaged = directory.path().join("other.mcap");
         let count = |bytes: &[u8]| {
-            std::fs::write(&other, bytes).unwrap();
-            let log = Log::open(&other, &Options::default());
+            std::fs::write(&damaged, bytes).unwrap();
+            let log = Log::open(&damaged, &Options::default());
             log.map_or(0, |log| log.filter(Result::is_ok).count())
         };
         assert_eq!(count(&whole), 20);

@@ -1,10 +1,10 @@
-//! Logs of angular velocity that others wrote: read row by row in SI units, cut into segments of one motion each.
+//! Reads logs of angular velocity from other programs, row by row in SI units, split into segments of one motion each.
 //!
 //! | file | duty |
 //! |---|---|
-//! | `log` | a log, row by row, and where its segments begin |
-//! | `form` | what is told of a log, what a form of file gives, why it cannot be read |
-//! | `columns` | which column is what, and in which unit |
+//! | `log` | a log, row by row, and the beginning of its segments |
+//! | `form` | options of a log, rows of a file format, errors |
+//! | `columns` | the column and the unit of each quantity |
 //! | `csv` | rows of a CSV file |
 //! | `mcap` | rows of an MCAP file |
 //! | `parquet` | rows of a Parquet file, with the feature of that name |
@@ -12,8 +12,8 @@
 //! | `identification` | a body's inertia from logs |
 //! | `estimation` | a log's hidden component |
 //!
-//! A log may be larger than memory: a row is read when it is asked for. Must not interpolate, repair or invent a value; what
-//! is left out is counted, and what is assumed is told.
+//! A log may be larger than memory: each row is read on demand. Must not interpolate, repair or invent a value; omitted rows
+//! are counted, and assumptions are reported.
 
 mod columns;
 mod csv;

@@ -1,4 +1,4 @@
-//! Rows of a Parquet file: numbers in plain columns, nothing nested. Must not hold more of it than a batch of rows.
+//! Reads rows of a Parquet file: numbers in plain columns, without nesting. Must not hold more than a batch of rows.
 
 use super::columns::{self, Places};
 use super::form::{DataError, Meaning, Options, Row, Rows};
@@ -11,34 +11,34 @@ use parquet::file::reader::{FileReader, SerializedFileReader};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
-/// So many rows are read at once.
+/// The number of rows read at once.
 const BATCH_ROWS: usize = 8192;
 
-/// A Parquet file that is being read.
+/// A reader of a Parquet file.
 pub struct ParquetLog {
     path: PathBuf,
     reader: SerializedFileReader<File>,
     places: Places,
     /// The next group of rows.
     group: usize,
-    /// What is read of the group at hand: stamps, then rates, then the key.
+    /// The columns read of the current group: stamps, then rates, then the key.
     columns: Vec<Option<Column>>,
-    /// Rows of the batch that were given, and all of it.
+    /// The rows returned from the batch, and all its rows.
     given: usize,
     batch: usize,
     rows: u64,
 }
 
-/// One column of a group of rows, and a batch of it.
+/// One column of a group of rows, with its current batch.
 struct Column {
     name: String,
     reader: ColumnReader,
-    /// Of a value that may be missing: 0 or this.
+    /// The definition level of a present value; 0 if every value is present.
     defined: i16,
     cells: Vec<Cell>,
 }
 
-/// What stands in a row of a column.
+/// A value of a column.
 #[derive(Debug, Clone, PartialEq)]
 enum Cell {
     None,
@@ -48,7 +48,7 @@ enum Cell {
 }
 
 impl ParquetLog {
-    /// Whether a file begins as a Parquet file does.
+    /// Returns true if a file begins with the Parquet magic.
     pub fn is_begun(start: &[u8]) -> bool {
         start.starts_with(b"PAR1")
     }
@@ -62,18 +62,18 @@ impl ParquetLog {
         let mut places = columns::find(&names, path, &Options { header: true, ..options.clone() })?;
         let time = schema.column(places.time);
         if let (None, Some(LogicalType::Timestamp(about))) = (options.time_unit, time.logical_type_ref()) {
-            // The type says what a name can only hint at.
+            // The type is certain; a name is only a hint.
             places.meaning.time.1 = match about.unit {
                 Unit::MILLIS => TimeUnit::Milliseconds,
                 Unit::MICROS => TimeUnit::Microseconds,
                 Unit::NANOS => TimeUnit::Nanoseconds,
             };
-            places.meaning.assumed.retain(|what| *what != "time");
+            places.meaning.assumed.retain(|unit| *unit != "time");
         }
         Ok(Self { path: path.to_owned(), reader, places, group: 0, columns: Vec::new(), given: 0, batch: 0, rows: 0 })
     }
 
-    /// Reads the next batch, of the next group where the last one has ended; false at the end.
+    /// Reads the next batch, from the next group once the current one has ended; returns false at the end.
     fn refill(&mut self) -> Result<bool, ParquetError> {
         loop {
             let mut count = 0;
@@ -133,7 +133,7 @@ impl ParquetLog {
     }
 }
 
-/// A file that cannot be read.
+/// Returns the error for a file that cannot be read.
 fn form(path: &Path, row: u64, error: &ParquetError) -> DataError {
     let reason =
         format!("it cannot be read as Parquet ({error}); write it again, unpacked or packed with zstd or snappy");
@@ -141,7 +141,7 @@ fn form(path: &Path, row: u64, error: &ParquetError) -> DataError {
 }
 
 impl Column {
-    /// Reads a batch; returns its rows.
+    /// Reads a batch; returns the number of rows.
     fn read(&mut self) -> Result<usize, ParquetError> {
         let defined = self.defined;
         macro_rules! read {
@@ -272,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn columns_of_any_numbers_are_read_across_groups_with_what_is_missing() {
+    fn numeric_columns_are_read_across_groups_with_missing_values() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("log.parquet");
         for compression in [Compression::UNCOMPRESSED, Compression::SNAPPY] {
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn a_text_for_a_number_and_a_file_that_is_cut_are_refused() {
+    fn a_text_column_and_a_truncated_file_are_refused() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("log.parquet");
         file(&path, Compression::UNCOMPRESSED);

@@ -1,8 +1,9 @@
-//! Time stamps as files have them. Nanoseconds since 1970 do not fit a 64-bit float: whole part and fraction are kept apart.
+//! Time stamps of files, without rounding. A 64-bit float cannot hold nanoseconds since 1970, so whole part and fraction are
+//! separate.
 
 use super::unit::TimeUnit;
 
-/// A stamp, in the unit of its column.
+/// A time stamp in the unit of its column.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Stamp {
     whole: i64,
@@ -11,19 +12,19 @@ pub struct Stamp {
 }
 
 impl Stamp {
-    /// A whole number of units.
+    /// Creates a stamp of a whole number of units.
     pub fn whole(whole: i64, unit: TimeUnit) -> Self {
         Self { whole, part: 0.0, unit }
     }
 
-    /// A finite number of units; none for one of more than 63 bits.
+    /// Creates a stamp from a number of units; `None` unless it is finite and below 2^62 in magnitude.
     pub fn float(value: f64, unit: TimeUnit) -> Option<Self> {
         let whole = value.trunc();
-        // 2^62 is a float.
+        // 2^62 is exact as a float.
         (whole.abs() < (1_i64 << 62) as f64).then_some(Self { whole: whole as i64, part: value - whole, unit })
     }
 
-    /// A number in decimal digits, perhaps with a sign and a point; none for another text.
+    /// Parses a decimal number with optional minus sign and point; `None` for any other text.
     pub fn digits(text: &str, unit: TimeUnit) -> Option<Self> {
         let (whole, part) = text.split_once('.').unwrap_or((text, ""));
         let decimal = |digits: &str| digits.bytes().all(|digit| digit.is_ascii_digit());
@@ -35,10 +36,10 @@ impl Stamp {
         Some(Self { whole: value, part: if whole.starts_with('-') { -part } else { part }, unit })
     }
 
-    /// The time from another stamp to this one, s.
-    pub fn since_s(&self, other: &Self) -> f64 {
-        // Neither has more than 62 bits.
-        ((self.whole - other.whole) as f64 + (self.part - other.part)) / self.unit.per_second()
+    /// Returns the time from an earlier stamp to this one, s.
+    pub fn since_s(&self, earlier: &Self) -> f64 {
+        // No overflow: both whole parts are below 2^62 in magnitude.
+        ((self.whole - earlier.whole) as f64 + (self.part - earlier.part)) / self.unit.per_second()
     }
 }
 
@@ -58,7 +59,7 @@ mod tests {
     }
 
     #[test]
-    fn other_texts_and_numbers_are_none() {
+    fn invalid_texts_and_numbers_are_refused() {
         for text in ["", ".", "-", "1e3", "1.2.3", "0x1", "1-", "+1", "9223372036854775807", "1.-2"] {
             assert!(Stamp::digits(text, TimeUnit::Seconds).is_none(), "{text}");
         }

@@ -12,7 +12,7 @@ fn entries(text: &str, options: &Options) -> (Vec<Entry>, Counts) {
     (entries, *log.counts())
 }
 
-/// The first error, wherever it comes.
+/// Returns the first error, on opening or in a row.
 fn refusal(text: &str, options: &Options) -> String {
     match log(text, options) {
         Err(error) => error.to_string(),
@@ -79,14 +79,14 @@ fn a_log_without_header_is_read_by_numbers() {
 }
 
 #[test]
-fn nanoseconds_since_1970_are_told_apart() {
+fn nanoseconds_since_1970_keep_their_differences() {
     let (entries, _) =
         entries("stamp_ns,wx,wy,wz\n1763800000000000000,0,0,0\n1763800000000000100,0,0,0\n", &Options::default());
     assert_eq!(entries[1].time_s, 1e-7);
 }
 
 #[test]
-fn what_is_no_log_is_refused_with_place_reason_and_remedy() {
+fn an_invalid_log_is_refused_with_place_reason_and_remedy() {
     let none = Options::default();
     for (text, words) in [
         ("", "it has no row of numbers"),
@@ -126,14 +126,14 @@ fn a_line_without_end_is_not_held_in_memory() {
 
 proptest! {
     #[test]
-    fn whatever_the_bytes_nothing_panics_and_what_is_read_is_sane(bytes in proptest::collection::vec(any::<u8>(), 0..400)) {
+    fn random_bytes_do_not_panic_and_rows_are_sane(bytes in proptest::collection::vec(any::<u8>(), 0..400)) {
         let mut text = b"t_s,wx,wy,wz\n".to_vec();
         text.extend(bytes);
         check(text);
     }
 
     #[test]
-    fn nor_whatever_the_cells(rows in proptest::collection::vec(
+    fn random_cells_do_not_panic_and_rows_are_sane(rows in proptest::collection::vec(
         proptest::collection::vec("-?[0-9]{0,4}(\\.[0-9]{0,3})?(e[+-]?[0-9]{1,3})?|nan|inf|,|\"|;", 3..6), 0..30)
     ) {
         let lines: Vec<String> = rows.iter().map(|cells| cells.join(",")).collect();

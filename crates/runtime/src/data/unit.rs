@@ -1,4 +1,4 @@
-//! The units that a log's columns may have.
+//! Units of a log's columns.
 
 use std::fmt;
 
@@ -16,7 +16,7 @@ pub enum TimeUnit {
 }
 
 impl TimeUnit {
-    /// How many of it are a second.
+    /// Returns the number of units per second.
     pub fn per_second(self) -> f64 {
         match self {
             Self::Seconds => 1.0,
@@ -26,7 +26,7 @@ impl TimeUnit {
         }
     }
 
-    /// The unit of a name: `s`, `ms`, `us`, `ns`, or the word.
+    /// Parses a unit: `s`, `ms`, `us`, `ns`, or the word.
     pub fn parse(name: &str) -> Option<Self> {
         Some(match name {
             "s" | "sec" | "secs" | "second" | "seconds" => Self::Seconds,
@@ -59,7 +59,7 @@ pub enum RateUnit {
 }
 
 impl RateUnit {
-    /// One of it, rad/s.
+    /// Returns the unit in rad/s.
     pub fn rad_s(self) -> f64 {
         match self {
             Self::RadiansPerSecond => 1.0,
@@ -67,7 +67,7 @@ impl RateUnit {
         }
     }
 
-    /// The unit of a name: `rad/s`, `deg/s`, `dps`.
+    /// Parses a unit: `rad/s`, `deg/s`, `dps`.
     pub fn parse(name: &str) -> Option<Self> {
         Some(match name {
             "rad/s" | "rad_s" | "rad" => Self::RadiansPerSecond,
