@@ -1,6 +1,6 @@
-//! The `[accept]` table: what makes a run a test.
+//! The `[accept]` table: the criteria that make a run a test.
 //!
-//! Must not judge; what a run came to is held against it by `launch`.
+//! Must not judge; `launch` compares the results of a run with it.
 
 use super::checks::Checks;
 use super::nearest;
@@ -9,24 +9,24 @@ use super::reader::keys_of;
 use serde::Deserialize;
 use std::collections::BTreeMap;
 
-/// Acceptance criteria. Without any, nothing is judged.
+/// Acceptance criteria. A run without criteria is not judged.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Accept {
-    /// From this time on the limits apply, s.
+    /// The time from which the limits apply, s.
     pub settled_by_s: f64,
     /// Largest allowed value per metric of the rig, after settling.
     pub metric_max: BTreeMap<String, f64>,
-    /// From this time on the peaks count, s.
+    /// The time from which the peaks count, s.
     pub peak_from_s: f64,
-    /// Declared bound per metric of the rig: it may never be larger from `peak_from_s` on, whatever happens.
+    /// Bound per metric of the rig that holds at every tick from `peak_from_s` on, even after faults.
     pub metric_peak: BTreeMap<String, f64>,
-    /// The most ticks that roles may miss. One number limits the missed and starved ticks of all roles together.
+    /// The most ticks that roles may miss. A single number limits the missed and starved ticks of all roles together.
     pub missed_ticks_max: Option<TickLimit>,
-    /// The most ticks at which an input that was due may be absent.
+    /// The most ticks at which a due input may be absent.
     pub starved_ticks_max: Option<TickLimit>,
     /// The most ticks at which a driven body may apply its safe command.
     pub safe_ticks_max: Option<TickLimit>,
-    /// The most ticks that may be without a score. What is not scored beyond that leaves metrics unjudged.
+    /// The most ticks without a score. With more, the metrics are not judged.
     pub unscored_ticks_max: Option<TickAmount>,
     /// Limit of the 99th percentile of the estimate and of the control step, µs.
     pub step_latency_p99_us_max: Option<f64>,
@@ -44,25 +44,25 @@ pub enum TickLimit {
 /// An amount of ticks.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum TickAmount {
-    /// So many.
+    /// A number of ticks.
     Count(u64),
-    /// This part of the ticks, 0 to 1.
+    /// A fraction of the ticks, 0 to 1.
     Share(f64),
 }
 
 impl TickAmount {
-    /// The amount of `ticks`, in whole ticks.
+    /// Returns this amount of `ticks`, in whole ticks.
     pub fn count(self, ticks: u64) -> u64 {
         match self {
             Self::Count(count) => count,
-            // A part in a million more: 1 % of 300 ticks is 3, whatever the rounding.
+            // A billionth more: 1 % of 300 ticks is 3, despite rounding.
             Self::Share(share) => (share * ticks as f64 * (1.0 + 1e-9)) as u64,
         }
     }
 }
 
 impl Accept {
-    /// Returns true if no criterion is stated: then nothing is judged, by a default neither.
+    /// Returns true if no criterion is given; then nothing is judged, not even by a default.
     pub fn is_empty(&self) -> bool {
         let ticks = [&self.missed_ticks_max, &self.starved_ticks_max, &self.safe_ticks_max];
         self.metric_max.is_empty()
@@ -72,7 +72,7 @@ impl Accept {
             && self.step_latency_p99_us_max.is_none()
     }
 
-    /// The limits of metrics by their keys.
+    /// Returns the limits of metrics by their keys.
     pub(crate) fn metric_limits(&self) -> BTreeMap<String, f64> {
         let max = self.metric_max.iter().map(|(metric, limit)| (format!("{metric}_max"), *limit));
         let peak = self.metric_peak.iter().map(|(metric, limit)| (format!("{metric}_peak"), *limit));
@@ -80,19 +80,19 @@ impl Accept {
     }
 }
 
-/// The criteria of metrics, by keys that are the rig's, of any type: an unknown key is refused as that, not for its value.
+/// The criteria of metrics, with keys of the rig. Values have any type, so that an unknown key is refused as unknown.
 #[derive(Deserialize)]
 pub(crate) struct Metrics {
     #[serde(default)]
     pub accept: toml::Table,
 }
 
-/// Returns true if a key is every rig's, so that no metric can have it.
+/// Returns true if a key is common to all rigs, so that no metric can have it.
 pub(crate) fn is_common(key: &str) -> bool {
     keys_of::<Raw>().contains(&key)
 }
 
-/// The scenario around the criteria. Without a rig, `metrics` are unknown, and keys that may be metrics are not checked.
+/// The scenario of the criteria. Without a rig, `metrics` are unknown, and keys that may be metrics are not checked.
 pub(crate) struct Setting<'a> {
     pub duration_s: f64,
     pub metrics: Option<&'a [&'a str]>,
@@ -176,7 +176,7 @@ fn instant(key: &str, value: Option<f64>, setting: &Setting<'_>, checks: &mut Ch
     value
 }
 
-/// Checks a limit on ticks, and its roles where they are known.
+/// Checks a limit on ticks, and its roles if they are known.
 fn limit(key: &str, raw: Option<&RawTicks>, roles: Option<&[&str]>, checks: &mut Checks<'_>) -> Option<TickLimit> {
     let path = format!("accept.{key}");
     match raw? {
@@ -222,22 +222,22 @@ fn amount(path: &str, raw: &RawTicks, checks: &mut Checks<'_>) -> Option<TickAmo
     }
 }
 
-/// The limits that a key belongs to, and its metric; `None` if it limits no metric.
+/// Returns the limits to which a key belongs, and its metric; `None` if it limits no metric.
 fn limit_of<'a>(
     accept: &'a mut Accept,
     key: &'a str,
     metrics: &[&str],
 ) -> Option<(&'a mut BTreeMap<String, f64>, &'a str)> {
-    let of = |suffix: &str| key.strip_suffix(suffix).filter(|metric| metrics.contains(metric));
-    match (of("_max"), of("_peak")) {
+    let metric_with = |suffix: &str| key.strip_suffix(suffix).filter(|metric| metrics.contains(metric));
+    match (metric_with("_max"), metric_with("_peak")) {
         (Some(metric), _) => Some((&mut accept.metric_max, metric)),
         (None, metric) => Some((&mut accept.metric_peak, metric?)),
     }
 }
 
 fn known(key: &str, metrics: &[&str]) -> String {
-    let of = |suffix: &'static str| metrics.iter().map(move |metric| format!("{metric}{suffix}"));
+    let keys_with = |suffix: &'static str| metrics.iter().map(move |metric| format!("{metric}{suffix}"));
     let common = keys_of::<Raw>().iter().map(|key| (*key).to_owned());
-    let known: Vec<String> = of("_max").chain(of("_peak")).chain(common).collect();
+    let known: Vec<String> = keys_with("_max").chain(keys_with("_peak")).chain(common).collect();
     nearest(key, &known.iter().map(String::as_str).collect::<Vec<_>>())
 }

@@ -1,20 +1,20 @@
-//! The bodies of a scenario, and the roles that follow from them.
+//! The bodies of a scenario and their roles.
 
 use std::borrow::Cow;
 
 /// One body of a rig, or a fleet of them.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BodyInfo {
-    /// The name of its role and its part of service names.
+    /// The name of its role, also part of service names.
     pub name: Cow<'static, str>,
-    /// Whether the controller drives it.
+    /// True if the controller drives it.
     pub driven: bool,
-    /// How many bodies it is, if it is a fleet: many in one process, driven as one.
+    /// The number of bodies of a fleet, which share one process and are driven as one; `None` for a single body.
     pub fleet: Option<usize>,
 }
 
 impl BodyInfo {
-    /// How many bodies its signals tell of.
+    /// Returns the number of bodies in its signals.
     pub fn bodies(&self) -> usize {
         self.fleet.unwrap_or(1)
     }

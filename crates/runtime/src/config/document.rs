@@ -1,8 +1,8 @@
-//! A scenario's text with its overrides: one table, and where each key of it came from.
+//! A scenario's text with its overrides: one table, and the origin of each key.
 //!
 //! Must not know what any key means.
 
-use super::error::{MISSING_KEY, UNKNOWN_KEY, likest, nearest};
+use super::error::{MISSING_KEY, UNKNOWN_KEY, most_similar, nearest};
 use super::reader::{Refusal, read};
 use super::{ConfigError, PathError, Place, Problem, RunId, Shape};
 use serde::de::DeserializeOwned;
@@ -14,13 +14,13 @@ use std::sync::OnceLock;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-/// The longest text, bytes. What is longer is no scenario, and need not have an end.
+/// The longest text, bytes. A longer text is not a scenario and may be endless.
 const MAX_BYTES: u64 = 1 << 20;
-/// The most mistakes that are told at once.
+/// The most mistakes reported at once.
 const MAX_MISTAKES: usize = 20;
-/// The most steps in the key of an override. No key lies so deep.
+/// The most steps in the key of an override. No key is that deep.
 const MAX_STEPS: usize = 16;
-/// Every quantity is zero or between these in magnitude, so that no product of a few leaves the floating point's range.
+/// The range of nonzero quantities in magnitude, so that a product of a few stays within the floating-point range.
 const SMALLEST: f64 = 1e-30;
 const LARGEST: f64 = 1e30;
 
@@ -28,14 +28,14 @@ const LARGEST: f64 = 1e30;
 #[derive(Debug, Clone)]
 pub struct Document {
     pub(super) table: Table,
-    /// Key path, as `follower[0].name`, to a line of the file or `--set …`.
+    /// The place of each key path, such as `follower[0].name`: a line of the file or `--set …`.
     pub(super) places: BTreeMap<String, Place>,
     pub(super) origin: String,
-    /// The run whose file it is, as its first line says.
+    /// The run named in the file's first line.
     run: Option<RunId>,
-    /// Top-level keys that were split off: as good as known.
+    /// Top-level keys that were split off; they count as known.
     elsewhere: Vec<String>,
-    /// Where a document only asks what is read of it: that.
+    /// In a probe document, the shape of the first type read from it.
     asked: Option<OnceLock<Shape>>,
 }
 
@@ -50,7 +50,7 @@ impl Document {
         Self::parse(&text, &path.display().to_string())
     }
 
-    /// Parses a text; `origin` stands for the file in error messages.
+    /// Parses a text; error messages give `origin` as the file.
     ///
     /// # Errors
     /// [`ConfigError::Invalid`], also for a key that appears twice.
@@ -58,7 +58,7 @@ impl Document {
         let syntax = |error: toml::de::Error| {
             let place = error.span().map_or(origin.into(), |span| position(origin, text.as_bytes(), span.start));
             let key = error.span().and_then(|span| text.get(span)).unwrap_or_default();
-            // The parser's own words are all that it gives.
+            // The parser reports errors only as text.
             let (code, reason) = match error.message().trim() {
                 "duplicate key" => ("duplicate-key", format!("duplicate key `{key}`")),
                 message if message.ends_with("expected any valid TOML value") => {
@@ -82,12 +82,12 @@ impl Document {
         Ok(document)
     }
 
-    /// The run whose file it is.
+    /// Returns the run named in the file's first line.
     pub fn run(&self) -> Option<RunId> {
         self.run
     }
 
-    /// Applies one override of the form `key=value`; the value is TOML, or a bare word taken as a string.
+    /// Applies an override of the form `key=value`; the value is TOML, or a bare word as a string.
     ///
     /// # Errors
     /// [`ConfigError::Override`].
@@ -98,7 +98,7 @@ impl Document {
         self.refuse_absurd()
     }
 
-    /// Applies an option of its own name, which stands for an override of one key.
+    /// Applies a command-line option that overrides one key.
     ///
     /// # Errors
     /// [`ConfigError::Invalid`].
@@ -110,15 +110,15 @@ impl Document {
         self.refuse_absurd()
     }
 
-    /// Puts a value, as typed, at a path, as typed, and notes its place; or says what is wrong with them.
+    /// Parses a value and puts it at a path; records its place.
     fn assign(&mut self, path: &str, text: &str, place: Place) -> Result<(), PathError> {
         let value = parse_value(text.trim()).ok_or(PathError::NoValue)?;
         self.put_value(path, value, place)
     }
 
-    /// The same for a value that is one already.
+    /// Puts a value at a path and records its place.
     pub(super) fn put_value(&mut self, path: &str, value: Value, place: Place) -> Result<(), PathError> {
-        // Positions in a list also as error messages write them.
+        // List positions are also accepted in brackets, as error messages write them.
         let path = path.trim().replace('[', ".").replace(']', "");
         let steps: Vec<&str> = path.split('.').collect();
         if steps.iter().any(|step| step.is_empty()) {
@@ -128,9 +128,9 @@ impl Document {
             return Err(PathError::TooDeep);
         }
         let key = insert(&mut self.table, &steps, value)?;
-        // Whatever stood below the key is gone, and its places with it.
+        // All values below the key are replaced, so their places are removed.
         self.places.retain(|path, _| !is_below(path, &key));
-        // Tables on the way that were not there before are the override's too.
+        // The override also created the missing tables on the path.
         for (end, _) in key.match_indices(['.', '[']) {
             self.places.entry(key[..end].to_owned()).or_insert_with(|| place.clone());
         }
@@ -138,14 +138,14 @@ impl Document {
         Ok(())
     }
 
-    /// Takes the given top-level keys out into a document of their own.
+    /// Moves the given top-level keys into a new document.
     pub fn split_off(&mut self, keys: &[&str]) -> Self {
         let table = keys.iter().filter_map(|key| self.table.remove_entry(*key)).collect();
         self.elsewhere.extend(keys.iter().map(|key| (*key).to_owned()));
         self.part(table)
     }
 
-    /// Takes the keys of a table that are to be taken out into a document of their own, in a table of the same name.
+    /// Moves the keys of a table for which `taken` returns true into a table of the same name in a new document.
     pub fn split_off_within(&mut self, table: &str, taken: impl Fn(&str) -> bool) -> Self {
         let keys = self.table.get_mut(table).and_then(Value::as_table_mut);
         let split = keys.map_or_else(Table::new, |keys| {
@@ -157,25 +157,25 @@ impl Document {
         self.part(table)
     }
 
-    /// A document of a table that was taken out of this one.
+    /// Returns a document of a table that was removed from this one.
     pub(super) fn part(&self, table: Table) -> Self {
         let (places, origin) = (self.places.clone(), self.origin.clone());
         Self { table, places, origin, run: None, elsewhere: Vec::new(), asked: None }
     }
 
-    /// A document that has nothing and notes what is asked of it.
+    /// Creates an empty probe document that records the shape of the first type read from it.
     pub(crate) fn asking() -> Self {
         let (table, places, origin) = (Table::new(), BTreeMap::new(), String::new());
         Self { table, places, origin, run: None, elsewhere: Vec::new(), asked: Some(OnceLock::new()) }
     }
 
-    /// What the first type reads that was read from a document that asks.
+    /// Returns the shape of the first type read from a probe document.
     pub(crate) fn asked(self) -> Option<Shape> {
         self.asked?.into_inner()
     }
 
-    /// Refuses a list, as `[[key]]` makes one, at top-level keys that hold one table each: serde would take its elements
-    /// for the table's values.
+    /// Refuses a list, as from `[[key]]`, at top-level keys that hold one table each: serde would take its elements for the
+    /// table's values.
     ///
     /// # Errors
     /// [`ConfigError::Invalid`].
@@ -191,7 +191,7 @@ impl Document {
         }
     }
 
-    /// The string at a top-level key, if there is one.
+    /// Returns the string at a top-level key, if any.
     pub fn text(&self, key: &str) -> Option<&str> {
         self.table.get(key).and_then(Value::as_str)
     }
@@ -199,39 +199,39 @@ impl Document {
     /// Reads the table into a type.
     ///
     /// # Errors
-    /// [`ConfigError::Invalid`] with all mistakes, each with the place of the key.
+    /// [`ConfigError::Invalid`] with all mistakes, each with its key's place.
     pub fn read_into<T: DeserializeOwned>(&self) -> Result<T, ConfigError> {
         if let Some(asked) = &self.asked {
             let _ = asked.set(Shape::read_by::<T>());
         }
-        self.read_once().map_err(|problem| ConfigError::Invalid { problems: self.with_others::<T>(*problem) })
+        self.read_once().map_err(|problem| ConfigError::Invalid { problems: self.with_further_mistakes::<T>(*problem) })
     }
 
     fn read_once<T: DeserializeOwned>(&self) -> Result<T, Box<Problem>> {
-        read(&self.table).map_err(|(path, refusal)| Box::new(self.explain(path, &refusal)))
+        read(&self.table).map_err(|(path, refusal)| Box::new(self.problem(path, &refusal)))
     }
 
-    /// Returns a mistake with those that are found once it is mended, and so on.
-    fn with_others<T: DeserializeOwned>(&self, first: Problem) -> Vec<Problem> {
-        let (shape, mut mended, mut found) = (Shape::read_by::<T>(), self.clone(), Vec::<Problem>::new());
+    /// Returns a mistake and those found after repairing it, repeatedly.
+    fn with_further_mistakes<T: DeserializeOwned>(&self, first: Problem) -> Vec<Problem> {
+        let (shape, mut repaired, mut found) = (Shape::read_by::<T>(), self.clone(), Vec::<Problem>::new());
         let mut next = Some(first);
         for _ in 0..MAX_MISTAKES {
-            // What could not be mended is met again.
+            // A mistake that could not be repaired is found again.
             let Some(problem) = next.take().filter(|problem| !found.contains(problem)) else { break };
-            if mended.mend(&problem, &shape) {
-                next = mended.read_once::<T>().err().map(|problem| *problem);
+            if repaired.repair(&problem, &shape) {
+                next = repaired.read_once::<T>().err().map(|problem| *problem);
             }
             found.push(problem);
         }
-        // What is only misspelt is not missing too.
+        // A misspelt key is not reported as missing too.
         let misspelt = found.iter().filter(|problem| problem.code == UNKNOWN_KEY);
         let meant: Vec<String> = misspelt.filter_map(|problem| problem.meant.clone()).collect();
         found.retain(|problem| problem.code != MISSING_KEY || !meant.contains(&problem.key));
         found
     }
 
-    /// Makes a table that does not have a mistake any more, for the sake of the next one; false where that is not possible.
-    fn mend(&mut self, problem: &Problem, shape: &Shape) -> bool {
+    /// Removes a mistake from the table, so that the next one can be found. Returns false if that is not possible.
+    fn repair(&mut self, problem: &Problem, shape: &Shape) -> bool {
         let path = problem.key.replace('[', ".").replace(']', "");
         let steps: Vec<&str> = path.split('.').collect();
         let known = steps.iter().try_fold((shape, true), |(shape, _), step| shape.below(step));
@@ -243,21 +243,21 @@ impl Document {
 
     fn remove(&mut self, steps: &[&str]) -> Option<Value> {
         let (last, parents) = steps.split_last()?;
-        let Some((first, others)) = parents.split_first() else { return self.table.remove(*last) };
-        let place = others.iter().try_fold(self.table.get_mut(*first)?, |place, step| match place {
+        let Some((first, inner)) = parents.split_first() else { return self.table.remove(*last) };
+        let parent = inner.iter().try_fold(self.table.get_mut(*first)?, |parent, step| match parent {
             Value::Table(table) => table.get_mut(*step),
             Value::Array(list) => list.get_mut(step.parse::<usize>().ok()?),
             _ => None,
         });
-        place?.as_table_mut()?.remove(*last)
+        parent?.as_table_mut()?.remove(*last)
     }
 
-    /// Where the files are that it names: beside its own.
+    /// Returns the directory of the file, to which the files that it names are relative.
     pub fn directory(&self) -> &Path {
         Path::new(&self.origin).parent().unwrap_or(Path::new(""))
     }
 
-    /// The place of a key, or of the nearest table around it, or the file.
+    /// Returns the place of a key, or of the nearest enclosing table, or the file.
     pub fn place(&self, key: &str) -> Place {
         let mut path = key;
         loop {
@@ -271,7 +271,7 @@ impl Document {
         }
     }
 
-    fn explain(&self, path: String, refusal: &Refusal) -> Problem {
+    fn problem(&self, path: String, refusal: &Refusal) -> Problem {
         let join = |field: &str| if path.is_empty() { field.to_owned() } else { format!("{path}.{field}") };
         match refusal {
             Refusal::UnknownKey { key: field, known } => {
@@ -279,7 +279,7 @@ impl Document {
                 let elsewhere = self.elsewhere.iter().filter(|_| path.is_empty()).map(String::as_str);
                 let known: Vec<&str> = known.iter().copied().chain(elsewhere).collect();
                 let reason = format!("unknown key; {}", nearest(field, &known));
-                let meant = likest(field, &known).map(join);
+                let meant = most_similar(field, &known).map(join);
                 Problem { meant, ..Problem::new(self.place(&key), key, UNKNOWN_KEY, reason) }
             }
             Refusal::MissingKey(field) => {
@@ -294,7 +294,7 @@ impl Document {
         self.refuse_absurd_value(&Value::Table(self.table.clone()), String::new())
     }
 
-    /// Refuses a number that is no quantity in a value at a path.
+    /// Refuses implausible numbers in the value at a path.
     pub(super) fn refuse_absurd_value(&self, value: &Value, path: String) -> Result<(), ConfigError> {
         match absurd(value, path) {
             Some((key, value)) => {
@@ -311,7 +311,7 @@ impl Document {
     }
 }
 
-/// Reads a scenario's text to its end; `origin` stands for the file in error messages.
+/// Reads a scenario's text to its end; error messages give `origin` as the file.
 ///
 /// # Errors
 /// [`ConfigError::Read`], and [`ConfigError::Invalid`] if it is not UTF-8.
@@ -328,7 +328,7 @@ pub fn read_text(reader: impl Read, origin: &Path) -> Result<String, ConfigError
     })
 }
 
-/// The line and the column of an offset in a text.
+/// Returns the line and the column of an offset in a text.
 fn position(origin: &str, text: &[u8], offset: usize) -> Place {
     let before = &text[..offset.min(text.len())];
     let column = 1 + before.iter().rev().take_while(|byte| **byte != b'\n').count();
@@ -409,7 +409,7 @@ fn descend<'a>(place: &'a mut Value, step: &str, path: &mut String) -> Result<&'
 fn absurd(value: &Value, path: String) -> Option<(String, f64)> {
     let plausible = |number: f64| number == 0.0 || (SMALLEST..=LARGEST).contains(&number.abs());
     match value {
-        // Whole numbers are small enough as they are: a seed may be any.
+        // Every integer is in range, and a seed may be any integer.
         Value::Float(number) if !plausible(*number) => Some((path, *number)),
         Value::Array(array) => {
             array.iter().enumerate().find_map(|(index, value)| absurd(value, format!("{path}[{index}]")))

@@ -1,4 +1,4 @@
-//! Changes of a document by whoever makes many scenarios of one.
+//! Edits of a document, for programs that derive many scenarios from one.
 //!
 //! Must not know what any key means.
 
@@ -7,40 +7,40 @@ use std::collections::BTreeMap;
 use toml::{Table, Value};
 
 impl Document {
-    /// Whether there is something at a top-level key.
+    /// Returns true if a top-level key exists.
     pub fn has(&self, key: &str) -> bool {
         self.table.contains_key(key)
     }
 
-    /// The whole of it.
+    /// Returns the whole table.
     pub fn table(&self) -> &Table {
         &self.table
     }
 
-    /// What is at a path, as an override names it.
+    /// Returns the value at a path, written as in an override.
     pub fn get(&self, path: &str) -> Option<&Value> {
         let mut steps = path.split('.');
         let first = self.table.get(steps.next()?)?;
-        steps.try_fold(first, |place, step| match place {
+        steps.try_fold(first, |parent, step| match parent {
             Value::Array(list) => list.get(step.parse::<usize>().ok()?),
-            other => other.get(step),
+            table => table.get(step),
         })
     }
 
-    /// Puts a value at a path, as an override does; `place` stands for the key's place in error messages.
+    /// Puts a value at a path, as an override does; error messages give `place` as the key's place.
     ///
     /// # Errors
-    /// [`ConfigError::Invalid`] where the path leads nowhere, or where the value is no quantity.
+    /// [`ConfigError::Invalid`] if the path does not exist, or the value is not a plausible quantity.
     pub fn put(&mut self, path: &str, value: Value, place: &Place) -> Result<(), ConfigError> {
-        let judged = value.clone();
+        let copy = value.clone();
         self.put_value(path, value, place.clone()).map_err(|error| {
             let reason = format!("{error}; name a key of the scenario, as --set does");
             ConfigError::invalid(place.clone(), path, (&error).into(), reason)
         })?;
-        self.refuse_absurd_value(&judged, path.to_owned())
+        self.refuse_absurd_value(&copy, path.to_owned())
     }
 
-    /// Takes the table at a top-level key out, as a document.
+    /// Removes the table at a top-level key and returns it as a document.
     pub fn take(&mut self, key: &str) -> Option<Self> {
         let Some(Value::Table(_)) = self.table.get(key) else { return None };
         let Some(Value::Table(table)) = self.table.remove(key) else { return None };
@@ -52,9 +52,9 @@ impl Document {
         Some(taken)
     }
 
-    /// Takes the list at a top-level key out of another document and adds its elements to the list here.
-    pub fn append(&mut self, key: &str, other: &mut Self) {
-        let Some(Value::Array(added)) = other.table.remove(key) else { return };
+    /// Moves the elements of the list at a top-level key from another document to the list here.
+    pub fn append(&mut self, key: &str, source: &mut Self) {
+        let Some(Value::Array(added)) = source.table.remove(key) else { return };
         let list = self.table.entry(key).or_insert_with(|| Value::Array(Vec::new()));
         let Value::Array(list) = list else { return };
         let first = list.len();
@@ -62,14 +62,14 @@ impl Document {
         let mut places = BTreeMap::new();
         for index in 0..added.len() {
             let (from, to) = (elements(index, 0), elements(index, first));
-            let below = other.places.iter().filter_map(|(path, place)| Some((path.strip_prefix(&from)?, place)));
+            let below = source.places.iter().filter_map(|(path, place)| Some((path.strip_prefix(&from)?, place)));
             places.extend(below.map(|(rest, place)| (format!("{to}{rest}"), place.clone())));
         }
         list.extend(added);
         self.places.extend(places);
     }
 
-    /// Takes an element out of the list at a top-level key; those behind it move up, and keep their places.
+    /// Removes an element from the list at a top-level key; later elements move up and keep their places.
     pub fn remove_element(&mut self, key: &str, index: usize) {
         let Some(Value::Array(list)) = self.table.get_mut(key) else { return };
         if index >= list.len() {
@@ -99,13 +99,13 @@ mod tests {
     }
 
     #[test]
-    fn elements_that_are_added_and_taken_out_keep_their_places() {
+    fn elements_keep_their_places_when_others_are_added_or_removed() {
         let mut document = parse("[[fault]]\na = 1\n", "base.toml");
-        let mut other = parse("x = 1\n[[fault]]\nb = 2\n[[fault]]\nc = [3]\n", "other.toml");
-        document.append("fault", &mut other);
+        let mut source = parse("x = 1\n[[fault]]\nb = 2\n[[fault]]\nc = [3]\n", "other.toml");
+        document.append("fault", &mut source);
         assert_eq!(document.place("fault[2].c[0]"), Place::line("other.toml", 5));
         assert_eq!(document.get("fault.2.c.0"), Some(&Value::Integer(3)));
-        assert!(other.has("x") && !other.has("fault"));
+        assert!(source.has("x") && !source.has("fault"));
         document.remove_element("fault", 1);
         assert_eq!(document.place("fault[1].c[0]"), Place::line("other.toml", 5));
         assert_eq!(document.place("fault[0].a"), Place::line("base.toml", 2));
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn a_table_that_is_taken_out_knows_its_lines() {
+    fn a_removed_table_keeps_its_lines() {
         let mut document = parse("x = 1\n[scenario]\na = 1\n[scenario.b]\nc = 2\n", "file.toml");
         let inner = document.take("scenario").unwrap();
         assert_eq!((inner.place("b.c"), inner.get("b.c")), (Place::line("file.toml", 5), Some(&Value::Integer(2))));
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn a_value_goes_where_an_override_would_put_it() {
+    fn a_value_is_put_like_an_override() {
         let mut document = parse("a = [1.0, 2.0]\n[b]\nc = 1\n", "file.toml");
         document.put("a.1", Value::Float(5.0), &Place::line("map.toml", 7)).unwrap();
         assert_eq!(

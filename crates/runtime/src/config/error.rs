@@ -1,9 +1,9 @@
-//! The mistakes of a scenario, each with its code, its place and its remedy.
+//! Mistakes of a scenario, each with its code, place and remedy.
 
 use std::fmt;
 use std::path::PathBuf;
 
-/// Why a scenario was refused. Nothing has been started.
+/// The reason why a scenario was refused. Nothing has been started.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file could not be read.
@@ -17,12 +17,12 @@ pub enum ConfigError {
     /// No scenario, or no campaign, of this name ships with the program.
     #[error("{text}")]
     Unknown {
-        /// The stable name of the mistake.
+        /// The stable code of the mistake.
         code: &'static str,
         /// Reason and remedy.
         text: String,
     },
-    /// An override on the command line has not the form key=value, or leads nowhere.
+    /// An override on the command line does not have the form key=value, or its path does not exist.
     #[error(
         "--set {}: {source}; write --set key=value, for example --set leader.initial_rate_rad_s=[0.6,-0.4,0.8] or --set follower.0.name=chaser",
         shown(argument)
@@ -41,7 +41,7 @@ pub enum ConfigError {
     },
 }
 
-/// Why a value cannot be put where a path leads.
+/// The reason why a value cannot be put at a path.
 #[derive(Debug, Clone, PartialEq, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum PathError {
@@ -65,7 +65,7 @@ pub enum PathError {
         /// As given.
         step: String,
     },
-    /// The list is shorter.
+    /// The list has no such position.
     #[error("`{}` has {length} entries, counted from 0: no {index}", shown(path))]
     NoElement {
         /// The list.
@@ -75,7 +75,7 @@ pub enum PathError {
         /// As given.
         index: usize,
     },
-    /// The path goes on below a plain value.
+    /// The path continues below a plain value.
     #[error("`{}` is a plain value: there is no `{}` below it", shown(path), shown(step))]
     PlainValue {
         /// The value.
@@ -86,7 +86,7 @@ pub enum PathError {
 }
 
 impl ConfigError {
-    /// A single mistake.
+    /// Creates an error of a single mistake.
     pub fn invalid(place: Place, key: impl Into<String>, code: &'static str, reason: impl Into<String>) -> Self {
         Problem::new(place, key, code, reason).into()
     }
@@ -101,11 +101,11 @@ impl ConfigError {
         }
     }
 
-    /// Joins this mistake with others, if they are mistakes of keys too.
-    pub(crate) fn and(self, others: impl IntoIterator<Item = Self>) -> Self {
+    /// Adds the problems of further errors to this one, if it consists of problems itself.
+    pub(crate) fn and(self, further: impl IntoIterator<Item = Self>) -> Self {
         match self {
             Self::Invalid { mut problems } => {
-                problems.extend(others.into_iter().flat_map(|other| match other {
+                problems.extend(further.into_iter().flat_map(|error| match error {
                     Self::Invalid { problems } => problems,
                     _ => Vec::new(),
                 }));
@@ -115,7 +115,7 @@ impl ConfigError {
         }
     }
 
-    /// Returns the mistake with a suggestion: a top-level key that belongs into a table is named with that table.
+    /// Adds a suggestion to each unknown top-level key that belongs into a table: the key with that table.
     pub(crate) fn within(mut self, nested: &[String]) -> Self {
         if let Self::Invalid { problems } = &mut self {
             for problem in problems.iter_mut().filter(|problem| problem.code == UNKNOWN_KEY) {
@@ -137,7 +137,7 @@ impl From<Problem> for ConfigError {
 pub(super) const UNKNOWN_KEY: &str = "unknown-key";
 pub(super) const MISSING_KEY: &str = "missing-key";
 
-/// Returns the key of a table whose last part is a top-level key's name, or much like it.
+/// Returns the nested key whose last part equals a top-level key, or resembles it closely.
 fn nested_key<'a>(key: &str, nested: &'a [String]) -> Option<&'a String> {
     if key.contains(['.', '[']) || key.len() > 64 {
         return None;
@@ -147,24 +147,24 @@ fn nested_key<'a>(key: &str, nested: &'a [String]) -> Option<&'a String> {
     (likeness(&best) > 0.9).then_some(best)
 }
 
-/// Returns the candidate that a word is most like, if it is like one.
-pub(super) fn likest<'a>(word: &str, candidates: &[&'a str]) -> Option<&'a str> {
-    // Nothing so long is a slip of the fingers, and comparing takes its time.
+/// Returns the candidate most similar to a word, if it is similar enough.
+pub(super) fn most_similar<'a>(word: &str, candidates: &[&'a str]) -> Option<&'a str> {
+    // A longer word is not a typing error, and comparing it is slow.
     let likeness = |known: &str| if word.len() > 64 { 0.0 } else { strsim::jaro_winkler(word, known) };
     let best = candidates.iter().copied().max_by(|a, b| likeness(a).total_cmp(&likeness(b)))?;
     (likeness(best) > 0.8).then_some(best)
 }
 
-/// "did you mean" for the nearest candidate, or the list of them.
+/// Returns "did you mean" with the nearest candidate, or the list of candidates.
 pub fn nearest(word: &str, candidates: &[&str]) -> String {
-    match likest(word, candidates) {
+    match most_similar(word, candidates) {
         Some(best) => format!("did you mean `{best}`?"),
         None if candidates.is_empty() => "no key is known here".to_owned(),
         None => format!("known here: {}", candidates.join(", ")),
     }
 }
 
-/// Where a key stands.
+/// The place of a key: file, line and column, or an option.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Place {
     /// The file, or the option with its value.
@@ -176,7 +176,7 @@ pub struct Place {
 }
 
 impl Place {
-    /// A line of a file.
+    /// Creates the place of a line of a file.
     pub(crate) fn line(origin: &str, line: usize) -> Self {
         Self { line: Some(line), ..origin.into() }
     }
@@ -195,18 +195,18 @@ impl fmt::Display for Place {
     }
 }
 
-/// One mistake: a line that is no TOML, a key, or a value.
+/// A mistake in a line that is not TOML, in a key, or in a value.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
     /// The place of the key.
     pub place: Place,
-    /// The key's full path; empty where the text is no TOML.
+    /// The key's full path; empty if the text is not TOML.
     pub key: String,
-    /// The stable name of the kind of mistake.
+    /// The stable code of the kind of mistake.
     pub code: &'static str,
     /// Reason and remedy.
     pub reason: String,
-    /// The key that was probably meant by one that is unknown.
+    /// The key that was probably meant, if the key is unknown.
     pub(super) meant: Option<String>,
 }
 
@@ -226,10 +226,10 @@ impl fmt::Display for Problem {
     }
 }
 
-/// The most of one part of a message, characters.
+/// The longest part of a message, characters.
 const MAX_SHOWN: usize = 400;
 
-/// Text from outside on one line: nothing that moves a terminal's cursor, and of a long text the beginning and the end.
+/// Returns foreign text for one line of output: without control characters, and of a long text only the beginning and the end.
 fn shown(text: &str) -> String {
     let clean = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
     let text: Vec<char> = text.chars().map(clean).collect();

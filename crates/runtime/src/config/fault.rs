@@ -1,6 +1,6 @@
-//! The `[[fault]]` tables of a scenario: as typed, with their checks, and as the runtime acts on them.
+//! The `[[fault]]` tables of a scenario: as typed, their checks, and as the runtime executes them.
 //!
-//! Must refuse a fault that would do nothing, or something else than its author meant.
+//! Must refuse a fault that has no effect, or another effect than its author meant.
 
 mod occurrence;
 mod raw;
@@ -15,38 +15,38 @@ use crate::fault::{self, Action, Change, ContentFault, Fault, Interruption, Tran
 use crate::sample::FieldKind;
 use raw::Kind;
 
-/// The most faults of one scenario.
+/// The most faults of a scenario.
 const MAX_FAULTS: usize = 64;
 /// The longest stall, ms.
 const MAX_STALL_MS: f64 = 60_000.0;
-/// The field whose bits tell which components of a sample are measured or observed.
+/// The field whose bits mark the components of a sample that are measured or observed.
 const VALID: &str = "valid";
 
-/// A scripted fault of a scenario, and where it acts.
+/// A scripted fault of a scenario, with the role and the body that it affects.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ScriptedFault {
     /// The role.
     pub role: String,
-    /// The body of whose signal a sample is concerned: a plant's measurement, the observer's estimate, the controller's
-    /// command. None for a fault of the role itself.
+    /// The body whose signal is affected: a plant's measurement, the observer's estimate, or the controller's command. `None` for a
+    /// fault of the role itself.
     pub body: Option<String>,
-    /// What happens, and when.
+    /// The effect of the fault, and its time.
     pub fault: Fault,
 }
 
-/// What faults are checked against.
+/// The scenario against which faults are checked.
 pub(crate) struct Setting<'a> {
     pub bodies: &'a [BodyInfo],
     /// The signals of the bodies.
     pub signals: &'a [Port],
-    /// The number of components, counted from the first, of which the `valid` word of measurements and estimates tells.
+    /// The number of leading components covered by the `valid` word of measurements and estimates.
     pub axes: usize,
     pub last_tick: u64,
     pub seed: u64,
     pub actuation_delay_ticks: u64,
 }
 
-/// Checks all faults of a scenario. What is refused is noted and left out.
+/// Checks all faults of a scenario. Refused faults are recorded and left out.
 pub(crate) fn resolve(raw: &[RawFault], setting: &Setting<'_>, checks: &mut Checks<'_>) -> Vec<ScriptedFault> {
     checks.require(raw.len() <= MAX_FAULTS, "fault", "too-many", || {
         format!(
@@ -54,19 +54,19 @@ pub(crate) fn resolve(raw: &[RawFault], setting: &Setting<'_>, checks: &mut Chec
             raw.len()
         )
     });
-    let each = raw.iter().enumerate().map(|(number, raw)| One { raw, number, setting, checks }.resolve());
+    let each = raw.iter().enumerate().map(|(number, raw)| FaultCheck { raw, number, setting, checks }.resolve());
     each.flatten().flatten().collect()
 }
 
-/// One fault being checked.
-struct One<'a, 'c, 'd> {
+/// The check of one fault.
+struct FaultCheck<'a, 'c, 'd> {
     raw: &'a RawFault,
     number: usize,
     setting: &'a Setting<'a>,
     checks: &'c mut Checks<'d>,
 }
 
-impl One<'_, '_, '_> {
+impl FaultCheck<'_, '_, '_> {
     fn key(&self, name: &str) -> String {
         format!("fault[{}].{name}", self.number)
     }
@@ -77,7 +77,7 @@ impl One<'_, '_, '_> {
         holds.then_some(())
     }
 
-    /// One fault per signal that it acts on: a controller has several.
+    /// Returns one fault per affected signal: a controller has several.
     fn resolve(mut self) -> Option<Vec<ScriptedFault>> {
         self.check_keys();
         self.check_time();
@@ -87,7 +87,7 @@ impl One<'_, '_, '_> {
         let seed = fault::seed(self.setting.seed, self.number as u64);
         let mut faults = Vec::new();
         for (index, body) in (0..).zip(bodies) {
-            // A fleet's samples have other fields than a single body's.
+            // A fleet's samples have different fields from a single body's.
             let action = self.action(body.as_deref())?;
             let fault = Fault { from_tick, ticks, occurrence, seed: fault::seed(seed, index), action };
             faults.push(ScriptedFault { role: self.raw.role.clone(), body, fault });
@@ -101,24 +101,24 @@ impl One<'_, '_, '_> {
         Some(faults)
     }
 
-    /// Keys that mean nothing for the kind, and such that it cannot do without.
+    /// Refuses keys without a meaning for the kind, and missing keys that it needs.
     fn check_keys(&mut self) {
         use Kind::{BitFlip, Delay, Freeze, Infinite, LostAxis, NoiseBurst, NotANumber, OutOfRange, Stall};
         let raw = self.raw;
-        let of = |kinds: &[Kind]| kinds.contains(&raw.kind);
-        let content = of(&[Freeze, NotANumber, Infinite, OutOfRange, BitFlip, NoiseBurst]);
+        let is = |kinds: &[Kind]| kinds.contains(&raw.kind);
+        let content = is(&[Freeze, NotANumber, Infinite, OutOfRange, BitFlip, NoiseBurst]);
         for (name, given, wanted, needed) in [
-            ("body", raw.body.is_some(), !self.of_role(), false),
+            ("body", raw.body.is_some(), !self.targets_role(), false),
             ("field", raw.field.is_some(), content, false),
-            ("component", raw.component.is_some(), content || of(&[LostAxis]), of(&[LostAxis])),
-            ("value", raw.value.is_some(), of(&[OutOfRange]), of(&[OutOfRange])),
-            ("bit", raw.bit.is_some(), of(&[BitFlip]), false),
-            ("deviation", raw.deviation.is_some(), of(&[NoiseBurst]), of(&[NoiseBurst])),
-            ("delay_ticks", raw.delay_ticks.is_some(), of(&[Delay]), of(&[Delay])),
-            ("jitter_ticks", raw.jitter_ticks.is_some(), of(&[Delay]), false),
-            ("distribution", raw.distribution.is_some(), of(&[Delay]), false),
-            ("spread_ticks", raw.spread_ticks.is_some(), of(&[Delay]), false),
-            ("stall_ms", raw.stall_ms.is_some(), of(&[Stall]), of(&[Stall])),
+            ("component", raw.component.is_some(), content || is(&[LostAxis]), is(&[LostAxis])),
+            ("value", raw.value.is_some(), is(&[OutOfRange]), is(&[OutOfRange])),
+            ("bit", raw.bit.is_some(), is(&[BitFlip]), false),
+            ("deviation", raw.deviation.is_some(), is(&[NoiseBurst]), is(&[NoiseBurst])),
+            ("delay_ticks", raw.delay_ticks.is_some(), is(&[Delay]), is(&[Delay])),
+            ("jitter_ticks", raw.jitter_ticks.is_some(), is(&[Delay]), false),
+            ("distribution", raw.distribution.is_some(), is(&[Delay]), false),
+            ("spread_ticks", raw.spread_ticks.is_some(), is(&[Delay]), false),
+            ("stall_ms", raw.stall_ms.is_some(), is(&[Stall]), is(&[Stall])),
         ] {
             self.require(wanted || !given, name, "unused-key", || "has no meaning for this kind; remove it".to_owned());
             self.require(given || !needed, name, "missing-key", || "is missing for this kind; add it".to_owned());
@@ -137,7 +137,7 @@ impl One<'_, '_, '_> {
         }
     }
 
-    /// The bodies whose signals are concerned; none, once, for a fault of the role itself.
+    /// Returns the bodies whose signals are affected; a single `None` for a fault of the role itself.
     fn bodies(&mut self) -> Option<Vec<Option<String>>> {
         let (raw, bodies) = (self.raw, self.setting.bodies);
         let driven: Vec<&str> = bodies.iter().filter(|body| body.driven).map(|body| &*body.name).collect();
@@ -145,7 +145,7 @@ impl One<'_, '_, '_> {
         self.require(roles.contains(&&*raw.role), "role", "unknown-role", || {
             format!("there is no role `{}` in this scenario; {}", raw.role, nearest(&raw.role, &roles))
         })?;
-        if self.of_role() {
+        if self.targets_role() {
             return Some(vec![None]);
         }
         if raw.role == "controller" {
@@ -164,7 +164,7 @@ impl One<'_, '_, '_> {
         Some(vec![Some(body.to_owned())])
     }
 
-    /// What happens to the samples about this body, or to the role itself.
+    /// Returns the fault's action on the samples about this body, or on the role itself.
     fn action(&mut self, body: Option<&str>) -> Option<Action> {
         let raw = self.raw;
         Some(match raw.kind {
@@ -187,7 +187,7 @@ impl One<'_, '_, '_> {
         })
     }
 
-    /// The fields of what the role sends about a body.
+    /// Returns the fields of the signal that the role sends about a body.
     fn fields(&self, body: &str) -> Option<Fields> {
         let signal = match &*self.raw.role {
             "observer" => Signal::Estimate,
@@ -195,9 +195,9 @@ impl One<'_, '_, '_> {
             _ => Signal::Measurement,
         };
         let port = self.setting.signals.iter().find(|port| port.topic.body == body && port.topic.signal == signal)?;
-        // A fleet's samples have no word for all of its bodies' components, nor have commands.
+        // Neither fleet samples nor commands have a word for the validity of all components.
         let has_axes = !port.fleet && signal != Signal::Command;
-        Some(Fields::of(port, if has_axes { self.setting.axes } else { 0 }))
+        Some(Fields::new(port, if has_axes { self.setting.axes } else { 0 }))
     }
 
     fn tamper(&mut self, fields: &Fields) -> Option<ContentFault> {
@@ -238,7 +238,7 @@ impl One<'_, '_, '_> {
         Some(ContentFault { change, words })
     }
 
-    /// The words of the field and component that are named; by default the first field, and all of its components.
+    /// Returns the words of the given field and component; by default all components of the first field.
     fn words(&mut self, fields: &Fields) -> Option<(WordRange, FieldKind)> {
         let raw = self.raw;
         let names: Vec<&str> = fields.all.iter().map(|(name, ..)| *name).collect();
@@ -277,13 +277,13 @@ struct Fields {
     all: Vec<(&'static str, WordRange, FieldKind)>,
     first: &'static str,
     content: WordRange,
-    /// The number of leading components that its `valid` word tells of.
+    /// The number of leading components covered by the `valid` word.
     axes: usize,
 }
 
 impl Fields {
-    fn of(port: &Port, axes: usize) -> Self {
-        // In a fleet's sample the fields of the whole precede the vectors.
+    fn new(port: &Port, axes: usize) -> Self {
+        // In a fleet's sample the common fields precede the vectors.
         let first = port.fields.iter().find(|field| field.kind == FieldKind::F64).map_or(VALID, |field| field.name);
         let names = port.fields.iter().map(|field| field.name).chain(["tick", "generation"]);
         let all = names.filter_map(|name| fault::field(&port.fields, name).map(|(words, kind)| (name, words, kind)));

@@ -1,39 +1,39 @@
-//! The computers of a run: which roles each has, and what the ways between them may take.
+//! The hosts of a run: the roles of each, and the delay budgets of the links between them.
 //!
-//! Must not know how anything crosses from one to another.
+//! Must not know the transport between hosts.
 
 use super::checks::Checks;
 use serde::{Deserialize, Serialize};
 
-/// The longest budget, ticks: no command is on its way for longer.
+/// The longest budget, ticks: no command is in flight for longer.
 const BUDGET_MAX: u64 = crate::control::ACTUATION_DELAY_MAX;
 
-/// A computer of a run, with the roles that run there.
+/// A host of a run, with its roles.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Host {
-    /// Its name in this scenario.
+    /// The host's name in this scenario.
     pub name: String,
     /// The roles that run there.
     pub roles: Vec<String>,
 }
 
-/// What holds between the computers of a run.
+/// The network between the hosts of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Network {
-    /// How many ticks a way from one host to another may take, unless it has a budget of its own.
+    /// The delay budget from one host to another, ticks, for links without a budget of their own.
     pub budget_ticks: u64,
-    /// How hosts agree on the time.
+    /// The common time of the hosts.
     pub clock_source: ClockSource,
-    /// A host that says nothing for so long is lost, s.
+    /// The silence after which a host counts as lost, s.
     pub silence_timeout_s: f64,
-    /// The ways with a budget of their own.
+    /// The links with a budget of their own.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub link: Vec<LinkBudget>,
 }
 
-/// The budget of one way from a host to another.
+/// The delay budget of the link from one host to another.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LinkBudget {
@@ -41,17 +41,17 @@ pub struct LinkBudget {
     pub from: String,
     /// The host that receives.
     pub to: String,
-    /// How many ticks the way may take.
+    /// The delay budget, ticks.
     pub budget_ticks: u64,
 }
 
-/// How hosts agree on the time.
+/// The source of the common time of the hosts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ClockSource {
     /// Offset and drift of each host's monotonic clock are estimated over the network.
     Estimated,
-    /// CLOCK_TAI, which the machines keep alike, as by PTP; the network only confirms it.
+    /// CLOCK_TAI, which the machines synchronise, for example by PTP; the network only verifies it.
     System,
 }
 
@@ -70,50 +70,51 @@ impl Network {
 /// The hosts of a scenario, and the loop that crosses them.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Hosts {
-    /// In the order of the file; none where there is one computer.
+    /// The hosts in the order of the file; empty if there is only one.
     pub hosts: Vec<Host>,
-    /// What holds between them.
+    /// The network between the hosts.
     pub network: Network,
 }
 
 impl Hosts {
-    /// The name of the host that has a role; none where there is one computer.
+    /// Returns the name of the host that runs a role; `None` if there is only one host.
     pub fn host_of(&self, role: &str) -> Option<&str> {
-        let has = |host: &&Host| host.roles.iter().any(|other| other == role);
+        let has = |host: &&Host| host.roles.iter().any(|name| name == role);
         self.hosts.iter().find(has).map(|host| &*host.name)
     }
 
-    /// Ticks that a sample may take from one role to another.
-    fn way(&self, from: &str, to: &str) -> u64 {
+    /// Returns the delay budget from one role to another, ticks.
+    fn role_budget(&self, from: &str, to: &str) -> u64 {
         match (self.host_of(from), self.host_of(to)) {
             (Some(from), Some(to)) if from != to => self.budget(from, to),
             _ => 0,
         }
     }
 
-    /// Ticks that a sample may take from one host to another.
+    /// Returns the delay budget from one host to another, ticks.
     fn budget(&self, from: &str, to: &str) -> u64 {
         let link = self.network.link.iter().find(|link| link.from == from && link.to == to);
         link.map_or(self.network.budget_ticks, |link| link.budget_ticks)
     }
 
-    /// The smallest budget of a way from a host or to it.
+    /// Returns the smallest budget of a link from or to a host.
     pub fn least_budget(&self, host: &str) -> u64 {
-        let others = self.hosts.iter().map(|other| other.name.as_str()).filter(|other| *other != host);
-        let ways = others.flat_map(|other| [self.budget(host, other), self.budget(other, host)]);
-        ways.min().unwrap_or(self.network.budget_ticks)
+        let peers = self.hosts.iter().map(|peer| peer.name.as_str()).filter(|peer| *peer != host);
+        let budgets = peers.flat_map(|peer| [self.budget(host, peer), self.budget(peer, host)]);
+        budgets.min().unwrap_or(self.network.budget_ticks)
     }
 
-    /// How many ticks after its tick a role may still wait for inputs: the budgets on the way from the measurements to it, 0 where
-    /// nothing crosses. `bodies` are all bodies, the first of which is observed, and whether each is driven.
+    /// Returns the ticks after its own tick during which a role may still wait for inputs: the sum of the budgets from the
+    /// measurements to it, 0 if no input crosses hosts. `bodies` holds each body's name and true if it is driven; the first one is
+    /// observed.
     pub fn lag_ticks<'a>(&self, role: &str, bodies: impl Iterator<Item = (&'a str, bool)> + Clone) -> u64 {
         let Some((leader, _)) = bodies.clone().next() else { return 0 };
-        let estimated = self.way(leader, "observer");
+        let estimated = self.role_budget(leader, "observer");
         match role {
             "observer" => estimated,
             "controller" => {
-                let driven = bodies.filter(|(_, driven)| *driven).map(|(body, _)| self.way(body, "controller"));
-                driven.max().unwrap_or(0).max(estimated + self.way("observer", "controller"))
+                let driven = bodies.filter(|(_, driven)| *driven).map(|(body, _)| self.role_budget(body, "controller"));
+                driven.max().unwrap_or(0).max(estimated + self.role_budget("observer", "controller"))
             }
             _ => 0,
         }
@@ -139,13 +140,13 @@ pub(crate) fn check(hosts: &Hosts, bodies: &[(&str, bool)], roles: &[&str], dela
             taken.push(role);
         }
     }
-    let homeless: Vec<&str> = roles.iter().copied().filter(|role| !taken.contains(role)).collect();
-    checks.require(hosts.hosts.is_empty() || homeless.is_empty(), "host", "role-without-host", || {
-        format!("no host has the role {}; name every role once", homeless.join(", "))
+    let unassigned: Vec<&str> = roles.iter().copied().filter(|role| !taken.contains(role)).collect();
+    checks.require(hosts.hosts.is_empty() || unassigned.is_empty(), "host", "role-without-host", || {
+        format!("no host has the role {}; name every role once", unassigned.join(", "))
     });
     let lag = hosts.lag_ticks("controller", bodies.iter().copied());
     for (body, _) in bodies.iter().filter(|(_, driven)| *driven) {
-        let needed = lag + hosts.way("controller", body);
+        let needed = lag + hosts.role_budget("controller", body);
         checks.require(needed <= delay_ticks, "actuation_delay_ticks", "budget-too-long", || {
             format!(
                 "the budgets on the way from the measurements by the controller to {body} come to {needed} ticks, and a command \
@@ -155,7 +156,7 @@ pub(crate) fn check(hosts: &Hosts, bodies: &[(&str, bool)], roles: &[&str], dela
     }
 }
 
-/// Checks what can be judged without a rig.
+/// Runs the checks that need no rig.
 pub(crate) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[String], checks: &mut Checks<'_>) {
     let mut names: Vec<&str> = Vec::new();
     for (index, host) in hosts.hosts.iter().enumerate() {
@@ -205,7 +206,7 @@ pub(crate) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[
                 || format!("there is no host `{name}`; this scenario has: {}", names.join(", ")),
             );
         }
-        let again = links[..index].iter().any(|other| (&other.from, &other.to) == (from, to));
+        let again = links[..index].iter().any(|link| (&link.from, &link.to) == (from, to));
         checks.require(from != to && !again, &format!("network.link[{index}].to"), "no-such-link", || {
             format!("{from} to {to} is no way, or has its budget already; name each way between two hosts once")
         });
@@ -223,12 +224,12 @@ mod tests {
 
     const BODIES: [(&str, bool); 2] = [("leader", false), ("follower", true)];
 
-    fn hosts(of: &[(&str, &[&str])]) -> Hosts {
+    fn hosts(hosts: &[(&str, &[&str])]) -> Hosts {
         let host = |(name, roles): &(&str, &[&str])| Host {
             name: (*name).to_owned(),
             roles: roles.iter().map(|role| (*role).to_owned()).collect(),
         };
-        Hosts { hosts: of.iter().map(host).collect(), network: Network { budget_ticks: 3, ..Network::default() } }
+        Hosts { hosts: hosts.iter().map(host).collect(), network: Network { budget_ticks: 3, ..Network::default() } }
     }
 
     #[test]
@@ -245,7 +246,7 @@ mod tests {
         let network = Network { link: vec![link("a", "b", 1), link("c", "a", 9)], ..three.network.clone() };
         let three = Hosts { network, ..three };
         assert_eq!(
-            [lag(&three, "observer"), lag(&three, "controller"), three.way("controller", "follower")],
+            [lag(&three, "observer"), lag(&three, "controller"), three.role_budget("controller", "follower")],
             [1, 4, 9]
         );
         assert_eq!(["a", "b", "c"].map(|host| three.least_budget(host)), [1, 1, 3]);
@@ -257,13 +258,13 @@ mod tests {
     }
 
     #[test]
-    fn what_makes_no_sense_is_told_with_a_remedy() {
+    fn an_invalid_host_table_is_refused_with_a_remedy() {
         let bench = "[[host]]\nname = \"bench\"\nroles = [\"leader\", \"follower\"]\n";
-        let told = refusals(bench);
-        assert!(told.contains("host: no host has the role observer, controller; name every role once"), "{told}");
+        let refused = refusals(bench);
+        assert!(refused.contains("host: no host has the role observer, controller; name every role once"), "{refused}");
         let flight = "[[host]]\nname = \"flight\"\nroles = [\"observer\", \"controller\"]\n";
-        let told = refusals(&format!("{bench}{flight}"));
-        assert!(told.contains("come to 2 ticks, and a command acts after 1; give 2 or more"), "{told}");
+        let refused = refusals(&format!("{bench}{flight}"));
+        assert!(refused.contains("come to 2 ticks, and a command acts after 1; give 2 or more"), "{refused}");
         for (text, expected) in [
             ("[[host]]\nname = \"A b\"\nroles = []\n", "cannot name files"),
             ("[[host]]\nname = \"a\"\nroles = []\n", "without roles"),
@@ -276,8 +277,8 @@ mod tests {
             ("[[network.link]]\nfrom = \"a\"\nto = \"a\"\nbudget_ticks = 1\n", "is no way"),
             ("[network]\nclock_source = \"sundial\"\n", "sundial"),
         ] {
-            let told = refusals(text);
-            assert!(told.contains(expected) && told.contains("x.toml:"), "{told}");
+            let refused = refusals(text);
+            assert!(refused.contains(expected) && refused.contains("x.toml:"), "{refused}");
         }
     }
 

@@ -1,7 +1,6 @@
-//! Scenario files: text as typed, with its checks, and the [`Settings`] that it resolves to. Nothing is started on a scenario that
-//! is not valid.
+//! Scenario files: the text as typed, its checks, and the [`Settings`] that it resolves to. An invalid scenario starts nothing.
 //!
-//! Every error says where (file, line, key), why, and what to do. Must not touch the machine beyond reading the file.
+//! Every error gives file, line and key, the reason and the remedy. Must not touch the machine beyond reading the file.
 
 pub(crate) mod accept;
 mod body;
@@ -33,7 +32,7 @@ pub(crate) use shape::{Key, Shape};
 
 pub use error::nearest;
 
-/// Whether a text names what ships with the program; otherwise it is a file's path.
+/// Returns true if a text is the name of something shipped with the program, not a file's path.
 pub fn is_name(text: &str) -> bool {
     !text.contains('/') && !text.ends_with(".toml")
 }

@@ -51,21 +51,21 @@ fn next_tick() -> u64 {
     1
 }
 
-/// What makes the ticks of a run follow one another.
+/// The clock that drives the ticks of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ClockKind {
     /// Absolute deadlines on the monotonic clock, one process per role.
     #[default]
     Realtime,
-    /// Every role waits for its inputs, nobody looks at the time; one process per role.
+    /// Every role waits for its inputs, without regard to time; one process per role.
     Lockstep,
     /// The same roles in one thread, over links in memory.
     InProcess,
 }
 
 impl ClockKind {
-    /// The name that a scenario and the command line use.
+    /// Returns the name used in scenarios and on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::Realtime => "realtime",
@@ -96,25 +96,25 @@ impl Default for Actuator {
     }
 }
 
-/// What a real-time run asks of the machine. Whatever is not granted is reported, and the run goes on without it.
+/// The requests of a real-time run to the machine. A refused request is reported, and the run continues without it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Realtime {
-    /// SCHED_FIFO priority of all roles, 1 to 99; 0: do not ask.
+    /// SCHED_FIFO priority of all roles, 1 to 99; 0: no request.
     pub priority: i32,
     /// The cores of the roles.
     pub cores: Cores,
-    /// Whether roles lock their memory.
+    /// True if roles lock their memory.
     pub lock_memory: bool,
-    /// Whether the launcher holds `/dev/cpu_dma_latency` at 0, which keeps idle cores from sleeping deeply.
+    /// True if the launcher holds `/dev/cpu_dma_latency` at 0, which keeps idle cores out of deep sleep states.
     pub low_latency_idle: bool,
-    /// How a role waits for a sample.
+    /// The way in which a role waits for a sample.
     pub wake: Wake,
-    /// How long before a tick a role wakes to spin, µs; never more than a quarter of the period.
+    /// The time before a tick at which a role wakes to spin, µs; at most a quarter of the period.
     pub wake_lead_us: f64,
-    /// How long a role spins for a sample that is due before it sleeps, µs; never more than a quarter of the period.
+    /// The time for which a role spins for a due sample before it sleeps, µs; at most a quarter of the period.
     pub spin_us: f64,
-    /// The part of the period after which the controller goes on without samples that are still missing, 0 to 1.
+    /// The fraction of the period after which the controller continues without missing samples, 0 to 1.
     pub cutoff: f64,
 }
 
@@ -133,20 +133,20 @@ impl Default for Realtime {
     }
 }
 
-/// How a role waits for a sample that another role sends.
+/// The way in which a role waits for a sample from another role.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Wake {
-    /// Where SCHED_FIFO is granted: gives way to a sender on the same core, spins for one on another, then sleeps on the
-    /// sender's notifier. Elsewhere as `event`: among equals, who spins holds up whom it waits for.
+    /// With SCHED_FIFO: yields to a sender on the same core, spins for one on another core, then sleeps on the sender's notifier.
+    /// Without it, as `event`: at equal priority, spinning delays the sender.
     Auto,
-    /// Spins, whoever the sender is, then sleeps on its notifier.
+    /// Spins for every sender, then sleeps on its notifier.
     Spin,
     /// Sleeps on the sender's notifier at once.
     Event,
 }
 
-/// Where the roles run.
+/// The cores on which the roles run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(
     untagged,
@@ -155,7 +155,7 @@ pub enum Wake {
 pub enum Cores {
     /// `"auto"` or `"any"`.
     Named(NamedCores),
-    /// These: plants in turn; observer and controller on the next, or beside the leader and the first follower.
+    /// These cores: plants in turn; observer and controller on the next ones, or beside the leader and the first follower.
     List(Vec<usize>),
 }
 
@@ -163,7 +163,7 @@ pub enum Cores {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum NamedCores {
-    /// As a list of all cores that the process may use, where SCHED_FIFO is granted; otherwise as `any`.
+    /// With SCHED_FIFO, as a list of all cores that the process may use; otherwise as `any`.
     Auto,
     /// Leave it to the scheduler.
     Any,
@@ -190,7 +190,7 @@ impl Default for Launch {
     }
 }
 
-/// What follows where the controller's inputs or its commands are beyond a bound. The bounds are keys of the rig's.
+/// The reaction to inputs or commands of the controller that exceed a bound. The bounds are keys of the rig.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct Watchdog {
@@ -200,32 +200,32 @@ pub(crate) struct Watchdog {
     pub latch_after_ticks: Option<u64>,
 }
 
-/// What follows from a breach.
+/// The reaction to a breach.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum OnBreach {
-    /// It is counted.
+    /// Counts the breach.
     #[default]
     Count,
-    /// The controller falls silent for good, and the safe command takes over.
+    /// Silences the controller for the rest of the run, so that the safe command takes over.
     Safe,
 }
 
-/// What the launcher does about roles that die or hang while the ticks run.
+/// The launcher's reaction to roles that die or hang while the ticks run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Supervision {
-    /// What is done about a role that failed.
+    /// The reaction to a failed role.
     pub on_failure: Policy,
-    /// A role that says nothing for so long counts as hung and is killed, s. Roles speak every 20 ms.
+    /// The time without a heartbeat after which a role counts as hung and is killed, s. Roles send one every 20 ms.
     pub heartbeat_timeout_s: f64,
-    /// How often one role is started anew in a run.
+    /// The most restarts of one role in a run.
     pub restarts_max: u64,
     /// The least time between two starts of one role, s.
     pub restart_interval_s: f64,
 }
 
-/// The criteria that every rig has. Those of metrics are keys of the rig's.
+/// The criteria common to all rigs. The criteria of metrics are keys of the rig.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct Accept {
@@ -257,7 +257,7 @@ pub(crate) enum RawTicks {
     ByRole(BTreeMap<String, RawTicks>),
 }
 
-/// What is done about a role that failed, by role.
+/// The reaction to a failed role, by role.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(
     untagged,
@@ -266,17 +266,17 @@ pub(crate) enum RawTicks {
 pub enum Policy {
     /// The same for all.
     All(OnFailure),
-    /// By role; those not named are started anew.
+    /// By role; roles that are not named are restarted.
     ByRole(BTreeMap<String, OnFailure>),
 }
 
-/// What is done about a role that failed.
+/// The reaction to a failed role.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum OnFailure {
-    /// Start it anew.
+    /// Restart it.
     Restart,
-    /// End the run in order; exit code 4.
+    /// End the run in an orderly way; exit code 4.
     Stop,
 }
 
@@ -292,7 +292,7 @@ impl Default for Supervision {
 }
 
 impl Supervision {
-    /// What is done about a role that failed.
+    /// Returns the reaction to the failure of a role.
     pub fn reaction_to(&self, role: &str) -> OnFailure {
         match &self.on_failure {
             Policy::All(policy) => *policy,

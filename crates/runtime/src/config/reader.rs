@@ -1,5 +1,5 @@
-//! The one deserializer that types of scenarios are read by: from a value, noting the way to what they refuse; or from
-//! nothing, noting what they ask for. Each type is compiled for it alone.
+//! The deserializer for all types of scenarios. From a value, it records the path to what a type refuses; from nothing, it
+//! records the kind of value that a type requests. A single deserializer keeps each type compiled only once.
 //!
 //! Must not know what any key means.
 
@@ -14,7 +14,7 @@ use std::iter::Enumerate;
 use std::slice;
 use toml::{Table, Value, map};
 
-/// A step on the way to a value in a type.
+/// A step on the path to a value in a type.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Step {
     Key(&'static str),
@@ -24,7 +24,7 @@ pub(super) enum Step {
     Entry,
 }
 
-/// What a type asks for.
+/// The kind of value that a type requests.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Asked {
     Any,
@@ -40,7 +40,7 @@ pub(super) enum Asked {
     Table(&'static [&'static str]),
 }
 
-/// Why a type refuses what it is given, in words for an author of scenarios.
+/// The reason why a type refuses a value, in words for the author of a scenario.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub(super) enum Refusal {
     #[error("unknown key `{key}`")]
@@ -53,7 +53,7 @@ pub(super) enum Refusal {
     WrongType { given: String, wanted: String },
     #[error("got {given} values; give {wanted}")]
     WrongLength { given: usize, wanted: String },
-    /// In the type's own words.
+    /// The type's own message.
     #[error("{0}")]
     Other(String),
 }
@@ -121,30 +121,30 @@ fn plain(wanted: String) -> String {
         "a sequence" => "a list",
         "fewer elements in array" => "fewer values",
         table if table == "a map" || table.starts_with("struct ") => "a table",
-        other => {
-            let numbers = other.strip_prefix("an array of length ").map(|length| format!("a list of {length} numbers"));
+        text => {
+            let numbers = text.strip_prefix("an array of length ").map(|length| format!("a list of {length} numbers"));
             return numbers.unwrap_or(wanted);
         }
     };
     words.to_owned()
 }
 
-/// Reads a table into a type; otherwise the key of what the type refuses, as `a.b[0]`, and why.
+/// Reads a table into a type. The error holds the key of the refused value, as `a.b[0]`, and the reason.
 pub(super) fn read<T: DeserializeOwned>(table: &Table) -> Result<T, (String, Refusal)> {
     let notes = Notes::default();
     let reader = Reader { source: Source::Table(table), notes: &notes, depth: 0 };
     T::deserialize(reader).map_err(|refusal| (notes.path(), refusal))
 }
 
-/// What a type asks for at the end of a way.
+/// Returns the kind of value that a type requests at the end of a path.
 pub(super) fn asked<T: DeserializeOwned>(way: &[Step]) -> Option<Asked> {
     let notes = Notes::default();
-    // There is never more than is asked: always an error.
+    // This always fails: there is no value at the end.
     let _ = T::deserialize(Reader { source: Source::at_end(way, None), notes: &notes, depth: 0 });
     notes.asked.into_inner()
 }
 
-/// The names of a struct's fields, as serde has them; none of what is no struct.
+/// Returns the names of a struct's fields as serde has them; empty for other types.
 pub(crate) fn keys_of<T: DeserializeOwned>() -> &'static [&'static str] {
     match asked::<T>(&[]) {
         Some(Asked::Table(names)) => names,
@@ -152,42 +152,42 @@ pub(crate) fn keys_of<T: DeserializeOwned>() -> &'static [&'static str] {
     }
 }
 
-/// Why a type refuses a value at the end of a way, if it does. What it misses around the value is no refusal of it.
+/// Returns the reason why a type refuses a value at the end of a path, if it does. A key missing elsewhere does not count.
 pub(super) fn refusal<T: DeserializeOwned>(way: &[Step], value: &Value) -> Option<Refusal> {
     let notes = Notes::default();
     let error = T::deserialize(Reader { source: Source::at_end(way, Some(value)), notes: &notes, depth: 0 }).err()?;
     (notes.steps.borrow().len() >= way.len()).then_some(error)
 }
 
-/// What is noted while a type reads.
+/// The records made while a type reads.
 #[derive(Default)]
 struct Notes {
-    /// The steps to what is being read; to what was refused, once something was.
+    /// The steps to the current value, or to the refused one.
     steps: RefCell<Vec<String>>,
     asked: RefCell<Option<Asked>>,
 }
 
 impl Notes {
-    /// The key that they lead to.
+    /// Returns the key at the end of the steps.
     fn path(&self) -> String {
         self.steps.borrow().concat().trim_start_matches('.').to_owned()
     }
 }
 
-/// What there is to be read.
+/// The value to be read.
 #[derive(Clone, Copy)]
 enum Source<'a> {
     Table(&'a Table),
     List(&'a [Value]),
     Plain(&'a Value),
-    /// A table or a list of one entry: a step on a way, what follows it, and what is at the end.
+    /// A table or a list of one entry: a step on a path, the rest of the path, and the value at its end.
     Step(&'a Step, &'a [Step], Option<&'a Value>),
-    /// The type is only asked.
+    /// No value: the type is only probed.
     Nothing,
 }
 
 impl<'a> Source<'a> {
-    fn of(value: &'a Value) -> Self {
+    fn new(value: &'a Value) -> Self {
         match value {
             Value::Table(table) => Self::Table(table),
             Value::Array(list) => Self::List(list),
@@ -198,7 +198,7 @@ impl<'a> Source<'a> {
     fn at_end(way: &'a [Step], end: Option<&'a Value>) -> Self {
         match (way, end) {
             ([step, way @ ..], end) => Self::Step(step, way, end),
-            ([], Some(value)) => Self::of(value),
+            ([], Some(value)) => Self::new(value),
             ([], None) => Self::Nothing,
         }
     }
@@ -209,22 +209,22 @@ impl<'a> Source<'a> {
 struct Reader<'a> {
     source: Source<'a>,
     notes: &'a Notes,
-    /// How many steps lead to it.
+    /// The number of steps to the value.
     depth: usize,
 }
 
 impl Reader<'_> {
-    /// Reads what there is; notes what is asked for if that is nothing.
+    /// Passes the value to the visitor; records the requested kind if there is no value.
     fn give<'de, V: Visitor<'de>>(self, asked: Asked, visitor: V) -> Result<V::Value, Refusal> {
         let (rest, length) = match self.source {
             Source::Table(table) => (Rest::Table(table.iter()), None),
             Source::List(list) => (Rest::List(list.iter().enumerate()), Some(list.len())),
             Source::Step(step, way, end) => {
-                let one = |name| Rest::One(Some((name, Source::at_end(way, end))));
+                let single = |name| Rest::One(Some((name, Source::at_end(way, end))));
                 match (step, asked) {
-                    (Step::Key(name), Asked::Table(_)) => (one(name), None),
-                    (Step::Entry, Asked::Map) => (one("element"), None),
-                    (Step::Element, Asked::List | Asked::Array(_)) => (one("element"), Some(1)),
+                    (Step::Key(name), Asked::Table(_)) => (single(name), None),
+                    (Step::Entry, Asked::Map) => (single("element"), None),
+                    (Step::Element, Asked::List | Asked::Array(_)) => (single("element"), Some(1)),
                     _ => return Err(Refusal::custom("the way does not lead on")),
                 }
             }
@@ -232,7 +232,7 @@ impl Reader<'_> {
             Source::Plain(Value::Integer(number)) => return visitor.visit_i64(*number),
             Source::Plain(Value::Float(number)) => return visitor.visit_f64(*number),
             Source::Plain(Value::Boolean(flag)) => return visitor.visit_bool(*flag),
-            // A name may look like a date; tables and lists are never plain.
+            // Only dates are left, and a name may look like one; tables and lists are never plain.
             Source::Plain(date) => return visitor.visit_str(&date.to_string()),
             Source::Nothing => {
                 self.notes.asked.replace(Some(asked));
@@ -311,7 +311,7 @@ impl<'de> Deserializer<'de> for Reader<'_> {
         self.give(Asked::Table(names), visitor)
     }
 
-    /// A choice is a word, without anything below.
+    /// Reads a choice: a word without nested values.
     fn deserialize_enum<V: Visitor<'de>>(
         self,
         _name: &'static str,
@@ -328,13 +328,13 @@ impl<'de> Deserializer<'de> for Reader<'_> {
 /// The entries of a table or a list.
 struct Entries<'a> {
     rest: Rest<'a>,
-    /// Of the entry whose key has been read.
+    /// The step and the value of the entry whose key was read last.
     value: Option<(String, Source<'a>)>,
     notes: &'a Notes,
     depth: usize,
 }
 
-/// What of them has not been read.
+/// The entries that have not been read.
 enum Rest<'a> {
     Table(map::Iter<'a, String, Value>),
     List(Enumerate<slice::Iter<'a, Value>>),
@@ -342,13 +342,13 @@ enum Rest<'a> {
 }
 
 impl<'a> Iterator for Rest<'a> {
-    /// Key, step to be noted, and what is there.
+    /// The key, the step to be recorded, and the value.
     type Item = (&'a str, String, Source<'a>);
 
     fn next(&mut self) -> Option<Self::Item> {
         match self {
-            Self::Table(rest) => rest.next().map(|(key, value)| (key.as_str(), format!(".{key}"), Source::of(value))),
-            Self::List(rest) => rest.next().map(|(index, value)| ("", format!("[{index}]"), Source::of(value))),
+            Self::Table(rest) => rest.next().map(|(key, value)| (key.as_str(), format!(".{key}"), Source::new(value))),
+            Self::List(rest) => rest.next().map(|(index, value)| ("", format!("[{index}]"), Source::new(value))),
             Self::One(rest) => rest.take().map(|(key, source)| (key, format!(".{key}"), source)),
         }
     }
@@ -360,7 +360,7 @@ impl<'a> Entries<'a> {
         self.rest.next()
     }
 
-    /// Reads what is a step further in; the note of the step stays if that is refused.
+    /// Reads the value one step further; the step stays recorded if the value is refused.
     fn enter<'de, S: DeserializeSeed<'de>>(
         &self,
         step: String,
@@ -444,7 +444,7 @@ mod tests {
     }
 
     #[test]
-    fn reads_what_there_is() {
+    fn a_valid_table_is_read() {
         let Outer { name, count, inner, limits } = read_text(TEXT).unwrap();
         assert_eq!((&*name, count, limits["x"]), ("a", 3, 1.0));
         let [first, second] = &inner[..] else { panic!("there are two") };
@@ -454,7 +454,7 @@ mod tests {
     }
 
     #[test]
-    fn tells_where_and_why_it_refuses() {
+    fn a_refusal_has_its_path_and_reason() {
         let kind =
             |given: &str, wanted: &str| Refusal::WrongType { given: given.to_owned(), wanted: wanted.to_owned() };
         let length = |given, wanted: &str| Refusal::WrongLength { given, wanted: wanted.to_owned() };
@@ -469,7 +469,7 @@ mod tests {
             ("count = 3\n", "", "", Refusal::MissingKey("count")),
             ("x = 1", "x = 'a'", "limits.x", kind("string \"a\"", "a number")),
             ("'w'", "1", "inner[1].either", Refusal::Other(variants)),
-            // What one variant refused is not where the next field is.
+            // A path refused by one variant must not affect the path of the next field.
             ("pair = [1, 2]", "pair = [1, true]", "inner[1].pair[1]", kind("boolean `true`", "a number")),
             ("pair = [1, 2]", "pair = [1, 2, 3]", "inner[1].pair", length(3, "fewer values")),
             ("pair = [1, 2]", "pair = [1]", "inner[1].pair", length(1, "a list of 2 numbers")),

@@ -1,12 +1,12 @@
-//! The identifier of a run, by which the files of its directory know each other.
+//! The identifier of a run, common to the files of its directory.
 //!
-//! Must not make one up: whoever starts a run does.
+//! Must not generate one: the program that starts the run does.
 
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// What comes before the identifier in a comment line.
+/// The text before the identifier in a comment line.
 const MARK: &str = "run ";
 
 /// 128 random bits, written as 32 hexadecimal digits. No result depends on them.
@@ -14,23 +14,23 @@ const MARK: &str = "run ";
 #[serde(into = "String", try_from = "String")]
 pub struct RunId(u128);
 
-/// A text is no identifier of a run.
+/// The error for a text that is not a run identifier.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("a run's identifier is 32 hexadecimal digits; take it from its summary.json")]
 pub struct NoRunId;
 
 impl RunId {
-    /// The identifier of these bits.
+    /// Creates an identifier from its bits.
     pub fn from_bits(bits: [u8; 16]) -> Self {
         Self(u128::from_le_bytes(bits))
     }
 
-    /// What a comment says of the run.
+    /// Returns the text of a comment that names the run.
     pub fn comment(self) -> String {
         format!("{MARK}{self}")
     }
 
-    /// The identifier in the first comment line, after `#`, of a text that names one.
+    /// Returns the identifier in the first `#` comment of a text that names one.
     pub fn in_comments_of(text: &str) -> Option<Self> {
         let comments = text.lines().filter_map(|line| line.strip_prefix('#'));
         comments
@@ -86,7 +86,7 @@ mod tests {
         }
 
         #[test]
-        fn no_text_makes_it_fail(text in any::<String>()) {
+        fn no_text_makes_it_panic(text in any::<String>()) {
             let _ = RunId::in_comments_of(&text);
             let _ = RunId::in_comments_of(&format!("# run {text}"));
             let _ = text.parse::<RunId>();
@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_identifier_is_none() {
+    fn an_invalid_identifier_is_refused() {
         for text in ["", "0", "+0000000000000000000000000000000", "0000000000000000000000000000000g"] {
             assert_eq!(text.parse::<RunId>(), Err(NoRunId), "{text}");
         }

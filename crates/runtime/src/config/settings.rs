@@ -1,4 +1,4 @@
-//! The settings of a run: all of a scenario but its rig, which is a type parameter of the code that runs it.
+//! The settings of a run: all of a scenario except its rig, which is a type parameter of the code that runs it.
 
 use super::accept::Accept;
 use super::body::{BodyInfo, role_names};
@@ -13,11 +13,11 @@ use crate::role::{Actuation, Rearm};
 /// The settings of a run.
 #[derive(Debug)]
 pub struct Settings {
-    /// Its name: part of service names and of the run directory's.
+    /// The name, part of service names and of the run directory's name.
     pub name: String,
-    /// What drives the ticks.
+    /// The clock that drives the ticks.
     pub clock: ClockKind,
-    /// The rate that was asked for, Hz.
+    /// The requested tick rate, Hz.
     pub tick_hz: f64,
     /// The period h, ns.
     pub period_ns: u64,
@@ -25,37 +25,37 @@ pub struct Settings {
     pub last_tick: u64,
     /// The seed of all randomness.
     pub seed: u64,
-    /// Whether every sample is to be recorded.
+    /// True if every sample is recorded.
     pub record: bool,
-    /// After how many missing commands a driven body goes to its safe command.
+    /// The number of missing commands after which a driven body applies its safe command.
     pub command_timeout_ticks: u64,
-    /// From so many ticks after its measurement on a command acts.
+    /// The delay from a measurement to the command's effect, ticks.
     pub actuation_delay_ticks: u64,
-    /// What ends the safe command.
+    /// The event that ends the safe command.
     pub rearm: Rearm,
-    /// What a real-time run asks of the machine.
+    /// The requests of a real-time run to the machine.
     pub realtime: Realtime,
-    /// How long the roles may take until all are ready, s.
+    /// The longest time until all roles are ready, s.
     pub startup_timeout_s: f64,
-    /// For how long an external role may keep the run waiting, s; if none, for ever until the ticks run, and then 30 s.
+    /// The longest time that the run waits for an external role, s. `None`: without limit before the first tick, then 30 s.
     pub external_timeout_s: Option<f64>,
-    /// The roles that share a process, where roles are processes.
+    /// The groups of roles that share a process, if roles are processes.
     pub processes: Vec<Vec<String>>,
-    /// Roles that somebody else starts: hardware, or a foreign program.
+    /// Roles that the launcher does not start: hardware, or another program.
     pub external: Vec<String>,
     /// Roles that wait for a debugger before the first tick.
     pub debug: Vec<String>,
-    /// What the launcher does about roles that fail.
+    /// The launcher's reaction to failed roles.
     pub supervision: Supervision,
-    /// The computers, if there are several, and what holds between them.
+    /// The hosts of a distributed run, and the network between them.
     pub hosts: Hosts,
-    /// What is to go wrong.
+    /// The faults to inject.
     pub faults: Vec<ScriptedFault>,
-    /// What the controller watches.
+    /// The bounds that the controller watches.
     pub watch: WatchBounds,
-    /// What the run is judged by.
+    /// The acceptance criteria.
     pub accept: Accept,
-    /// The run whose scenario this is, where there is one. Whoever starts another gives it another.
+    /// The run to which this scenario belongs, if any. Each new run gets a new identifier.
     pub run: Option<RunId>,
     /// The bodies of the rig; the first is the observed one.
     pub bodies: Vec<BodyInfo>,
@@ -71,10 +71,10 @@ impl Settings {
         role_names(&self.bodies)
     }
 
-    /// Why somebody else cannot start this role in a run of the scenario, if it is so.
+    /// Checks that another program may run this role.
     ///
     /// # Errors
-    /// The reason, with what to do.
+    /// [`NotExternal`] with the remedy.
     pub fn check_external(&self, role: &str) -> Result<(), NotExternal> {
         let roles = self.roles();
         if self.clock == ClockKind::InProcess {
@@ -86,53 +86,53 @@ impl Settings {
         if self.debug.iter().any(|debugged| debugged == role) {
             return Err(NotExternal::DebuggedAndExternal { role: role.to_owned() });
         }
-        let shared = self.processes.iter().any(|roles| roles.iter().any(|other| other == role));
+        let shared = self.processes.iter().any(|roles| roles.iter().any(|shared| shared == role));
         if shared { Err(NotExternal::SharedAndExternal { role: role.to_owned() }) } else { Ok(()) }
     }
 
-    /// How many ticks after its tick a role may still wait for what crosses hosts on the way to it.
+    /// Returns the ticks after its own tick during which a role may still wait for inputs that cross hosts.
     pub fn lag_ticks(&self, role: &str) -> u64 {
         self.hosts.lag_ticks(role, self.bodies.iter().map(|body| (&*body.name, body.driven)))
     }
 
-    /// Returns how long another host may be silent, s. One that starts is loaded, and its session may have to be replaced: it has
-    /// as long as a role has to come up.
+    /// Returns the longest silence of another host, s. A starting host is loaded, and its session may have to be replaced, so it
+    /// gets as long as a role may take to start.
     pub fn host_silence_s(&self, running: bool) -> f64 {
         let limit_s = self.hosts.network.silence_timeout_s;
         if running { limit_s } else { limit_s.max(self.startup_timeout_s) }
     }
 
-    /// The period h, s.
+    /// Returns the period h, s.
     pub fn tick_s(&self) -> f64 {
         self.period_ns as f64 / 1e9
     }
 
-    /// The time of a tick since the first, s.
+    /// Returns the time from the first tick to this one, s.
     pub fn time_s(&self, tick: u64) -> f64 {
         tick as f64 * self.tick_s()
     }
 
-    /// How the actuators of a body treat their commands.
+    /// Returns the actuator settings of a body.
     pub fn actuation(&self, driven: bool) -> Actuation {
         let (delay_ticks, timeout_ticks) = (self.actuation_delay_ticks, self.command_timeout_ticks);
         Actuation { driven, delay_ticks, timeout_ticks, rearm: self.rearm }
     }
 }
 
-/// Why a role cannot be another program's.
+/// The reason why another program cannot run a role.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum NotExternal {
-    /// The run has one process.
+    /// The run has a single process.
     #[error("one process has no room for another's role; give --clock realtime or lockstep")]
     OneProcess,
     /// The scenario has no such role.
     #[error("there is no such role; this scenario has: {known}")]
     UnknownRole {
-        /// The roles that it has.
+        /// The roles of the scenario.
         known: String,
     },
-    /// The run waits for a debugger of this role.
+    /// The role is in `launch.debug`.
     #[error(
         "another program takes the {role}: start that in a debugger, as `gdb --args …`, and take it out of launch.debug"
     )]

@@ -1,18 +1,18 @@
-//! What a type reads of a scenario, found out by letting it read: keys, kinds of values, choices, which keys must be there.
+//! Finds the shape that a type reads from a scenario by letting it read: keys, kinds of values, choices, and required keys.
 //!
-//! Must not know what any key means, nor need a word from the type beyond that it can be deserialized.
+//! Must not know what any key means, nor need anything from the type beyond `Deserialize`.
 
 use super::reader::{Asked, Refusal, Step, asked, refusal};
 use serde::de::DeserializeOwned;
 use toml::Value;
 
-/// The most steps to a value: what lies deeper is of a type that holds itself.
+/// The most steps to a value; only recursive types are deeper.
 const MAX_STEPS: usize = 12;
 
-/// What a value may be.
+/// The possible values at a place.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Shape {
-    /// Several kinds, which the type tells in words, or not at all.
+    /// Several kinds, with the type's own description, if it has one.
     Any(Option<String>),
     Boolean,
     Integer,
@@ -22,7 +22,7 @@ pub(crate) enum Shape {
     Text,
     Choice(&'static [&'static str]),
     List(Box<Shape>),
-    /// A list of so many.
+    /// A list of fixed length.
     Array(Box<Shape>, usize),
     /// A table of any keys.
     Map(Box<Shape>),
@@ -42,12 +42,12 @@ pub(crate) struct Key {
 }
 
 impl Shape {
-    /// What a type reads.
+    /// Returns the shape that a type reads.
     pub fn read_by<T: DeserializeOwned>() -> Self {
         at::<T>(&mut Vec::new())
     }
 
-    /// What lies a step further in: under a key, or at a position of a list; and whether it must be there.
+    /// Returns the shape one step further, under a key or at a list position, and true if a value is required there.
     pub fn below(&self, step: &str) -> Option<(&Self, bool)> {
         match self {
             Self::List(element) | Self::Array(element, _) => Some((element, true)),
@@ -57,7 +57,7 @@ impl Shape {
         }
     }
 
-    /// A value of this shape, if one is known.
+    /// Returns a value of this shape, if one is known.
     pub fn example(&self) -> Option<Value> {
         Some(match self {
             Self::Any(_) => return None,
@@ -78,7 +78,7 @@ impl Shape {
     }
 }
 
-/// The shape of what the type reads at the end of a way.
+/// Returns the shape that a type reads at the end of a path.
 fn at<T: DeserializeOwned>(way: &mut Vec<Step>) -> Shape {
     if way.len() > MAX_STEPS {
         return Shape::Any(None);
@@ -114,7 +114,7 @@ fn table<T: DeserializeOwned>(way: &mut Vec<Step>, names: &'static [&'static str
     };
     let mut keys: Vec<Key> = names.iter().map(|name| key(*name)).collect();
     let mut given = toml::Table::new();
-    // One after the other: only the first that is missing is complained of.
+    // One key after the other: serde reports only the first missing key.
     while let Some(Refusal::MissingKey(name)) = refusal::<T>(way, &Value::Table(given.clone())) {
         let Some(key) = keys.iter_mut().find(|key| key.name == name && !key.required) else { break };
         key.required = true;
@@ -126,7 +126,7 @@ fn table<T: DeserializeOwned>(way: &mut Vec<Step>, names: &'static [&'static str
     Shape::Table { keys, closed }
 }
 
-/// What a type that takes several kinds of values says to one that it does not take.
+/// Returns the remedy in the message of a type that takes several kinds of values.
 fn choices<T: DeserializeOwned>(way: &[Step]) -> Option<String> {
     let Some(Refusal::Other(words)) = refusal::<T>(way, &Value::Boolean(true)) else { return None };
     let (_, remedy) = words.split_once("; ")?;
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn a_type_tells_its_keys() {
+    fn the_shape_of_a_type_has_its_keys() {
         let Shape::Table { keys, closed } = Shape::read_by::<Outer>() else { panic!("it is a table") };
         assert!(!closed);
         let required: Vec<&str> = keys.iter().filter(|key| key.required).map(|key| key.name).collect();

@@ -1,6 +1,6 @@
-//! The `[watchdog]` table: which physical quantities the controller watches, and what follows from a breach.
+//! The `[watchdog]` table: the physical quantities that the controller watches, and the reaction to a breach.
 //!
-//! Must refuse a bound on what a rig does not tell: it would never be broken.
+//! Must refuse a bound on a quantity that a rig does not provide: it would never be breached.
 
 use super::checks::Checks;
 use super::nearest;

@@ -1,21 +1,21 @@
-//! The keys of a `[[fault]]` that say on which of its ticks it acts, and how late a sample is sent: as typed, with their checks.
+//! Checks the keys of a `[[fault]]` for its occurrence and for the delay of a sample.
 //!
-//! Must refuse two answers to one question, and what would never act as its author meant.
+//! Must refuse conflicting keys, and a fault that could never act as its author meant.
 
-use super::One;
+use super::FaultCheck;
 use super::raw::{DistributionName, Kind, MAX_DELAY_TICKS, PatternName, RawChannel, RawFault, RawWeaklyHard};
 use crate::fault::{Channel, Delay, Distribution, Occurrence, Pattern, WINDOW_MAX, WeaklyHard};
 
-impl One<'_, '_, '_> {
-    /// On which of its ticks the fault acts.
+impl FaultCheck<'_, '_, '_> {
+    /// Returns the fault's occurrence: the pattern of ticks at which it acts.
     pub(crate) fn occurrence(&mut self) -> Option<Occurrence> {
         let RawFault { every, gilbert_elliott, weakly_hard, probability, .. } = *self.raw;
-        let answers = [
+        let patterns = [
             ("every", every.is_some()),
             ("gilbert_elliott", gilbert_elliott.is_some()),
             ("weakly_hard", weakly_hard.is_some()),
         ];
-        let mut given = answers.into_iter().filter(|(_, given)| *given);
+        let mut given = patterns.into_iter().filter(|(_, given)| *given);
         let (first, second) = (given.next(), given.next());
         if let (Some((first, _)), Some((second, _))) = (first, second) {
             self.require(false, second, "conflicting-keys", || {
@@ -39,8 +39,8 @@ impl One<'_, '_, '_> {
         }
     }
 
-    /// Whether the fault lasts so long that the key has a meaning.
-    fn long_enough(&mut self, name: &str, ticks: u64) -> Option<()> {
+    /// Requires that the fault lasts long enough for the key to have an effect.
+    fn require_ticks(&mut self, name: &str, ticks: u64) -> Option<()> {
         self.require(self.raw.ticks >= ticks, "ticks", "out-of-range", || {
             format!("{} are too few for `{name}`; give at least {ticks}", self.raw.ticks)
         })
@@ -50,7 +50,7 @@ impl One<'_, '_, '_> {
         self.require(n >= 2, "every", "out-of-range", || {
             format!("every {n} is no interval; give 2 or more, or leave it out for every tick")
         })?;
-        self.long_enough("every", n.saturating_add(1))?;
+        self.require_ticks("every", n.saturating_add(1))?;
         Some(Occurrence::Every(n))
     }
 
@@ -71,7 +71,7 @@ impl One<'_, '_, '_> {
             "is the same as when_good, and the state of the channel changes nothing; give `probability` instead"
                 .to_owned()
         })?;
-        self.long_enough("gilbert_elliott", 2)?;
+        self.require_ticks("gilbert_elliott", 2)?;
         Some(Occurrence::GilbertElliott(Channel { good_to_bad, bad_to_good, when_good, when_bad }))
     }
 
@@ -87,7 +87,7 @@ impl One<'_, '_, '_> {
         self.require(pattern != PatternName::Random || probability < 1.0, "probability", "missing-key", || {
             "is missing for pattern = \"random\", or is 1, which makes it \"burst\"; give a number below 1".to_owned()
         })?;
-        self.long_enough("weakly_hard", window)?;
+        self.require_ticks("weakly_hard", window)?;
         let pattern = match pattern {
             PatternName::Random => Pattern::Random(probability),
             PatternName::Burst => Pattern::Burst,
@@ -96,9 +96,9 @@ impl One<'_, '_, '_> {
         Some(Occurrence::WeaklyHard(WeaklyHard { misses: misses as u32, window: window as u32, pattern }))
     }
 
-    /// How late samples are.
+    /// Returns the delay of samples.
     pub(crate) fn delay(&mut self) -> Option<Delay> {
-        // A command has until it is to act; everything else, until its own tick is over.
+        // A command may arrive until it is due; any other sample, until its own tick ends.
         let commands = self.raw.role == "controller";
         let slack_ticks = if commands { self.setting.actuation_delay_ticks - 1 } else { 0 };
         let delay = Delay { slack_ticks, ..self.lateness()? };
@@ -152,8 +152,8 @@ impl One<'_, '_, '_> {
         Some(Delay { jitter_ticks, distribution, ..Delay::constant(ticks) })
     }
 
-    /// Whether the fault is one of the role itself.
-    pub(crate) fn of_role(&self) -> bool {
+    /// Returns true if the fault affects the role itself.
+    pub(crate) fn targets_role(&self) -> bool {
         matches!(self.raw.kind, Kind::Stall | Kind::Kill | Kind::Miss)
     }
 }

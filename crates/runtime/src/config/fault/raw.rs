@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// The channel of Gilbert and Elliott, as a scenario has it.
+/// The Gilbert-Elliott channel as typed.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct RawChannel {
@@ -14,7 +14,7 @@ pub(crate) struct RawChannel {
     pub when_bad: f64,
 }
 
-/// A weakly-hard constraint, as a scenario has it.
+/// A weakly-hard constraint as typed.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct RawWeaklyHard {
@@ -31,7 +31,7 @@ pub(crate) enum PatternName {
     Even,
 }
 
-/// The distributions of a delay's jitter, as a scenario names them.
+/// The names of a delay's jitter distributions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum DistributionName {
@@ -40,10 +40,10 @@ pub(crate) enum DistributionName {
     Normal,
 }
 
-/// The longest delay, ticks: so many samples are kept.
+/// The longest delay, ticks; this many samples are kept.
 pub(crate) const MAX_DELAY_TICKS: u64 = 1000;
 
-/// The kinds, as a scenario names them.
+/// The names of the kinds of faults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum Kind {
@@ -70,7 +70,7 @@ pub(crate) struct RawFault {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub body: Option<String>,
     pub from_tick: u64,
-    #[serde(default = "one")]
+    #[serde(default = "single_tick")]
     pub ticks: u64,
     #[serde(default = "always")]
     pub probability: f64,
@@ -102,7 +102,7 @@ pub(crate) struct RawFault {
     pub stall_ms: Option<f64>,
 }
 
-fn one() -> u64 {
+fn single_tick() -> u64 {
     1
 }
 
