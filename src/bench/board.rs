@@ -1,34 +1,34 @@
-//! Where everything that was measured is collected: one value per round, and the distribution of all values.
+//! Collects all measurements: one value per round, and the distribution of all values.
 //!
-//! Must not drop a value, nor round one.
+//! Must not drop or round a value.
 
 use crate::telemetry::{Grant, Latency, Percentiles, quantile, sorted};
 
-/// What a figure is held against.
+/// The comparison of a figure with another one.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct Beside {
     /// The other figure, of the same row.
     pub figure: String,
-    /// This one over that one.
+    /// The figure divided by the other one.
     pub ratio: f64,
 }
 
-/// One thing that was measured.
+/// One measured quantity.
 #[derive(Debug, Clone, serde::Serialize)]
 pub struct Figure {
-    /// Its row.
+    /// The row of the figure.
     pub row: &'static str,
-    /// What it is; unique in its row.
+    /// The name of the figure, unique in its row.
     pub name: String,
     /// The unit of `rounds`; latencies are in µs.
     pub unit: &'static str,
     /// The median over the rounds.
     pub median: f64,
-    /// One value per round: of a latency, the round's median.
+    /// One value per round; for a latency, the round's median.
     pub rounds: Vec<f64>,
-    /// All values of all rounds, if it is a latency.
+    /// The percentiles over all rounds, if it is a latency.
     pub latency: Option<Percentiles>,
-    /// The floor that it stands beside, if there is one.
+    /// The comparison with its lower bound, if it has one.
     pub beside: Option<Beside>,
     #[serde(skip)]
     pub(super) pooled: Option<Latency>,
@@ -43,33 +43,33 @@ impl Figure {
     }
 }
 
-/// Everything that was measured.
+/// All measurements of a benchmark run.
 #[derive(Debug, Default)]
 pub struct Board {
-    /// The row that is being measured.
+    /// The current row.
     row: &'static str,
     figures: Vec<Figure>,
     remarks: Vec<String>,
     pub(super) grants: Vec<Grant>,
 }
 
-/// The median of some values.
+/// Returns the median.
 fn median(values: impl IntoIterator<Item = f64>) -> f64 {
     quantile(&sorted(values), 0.5).unwrap_or(f64::NAN)
 }
 
 impl Board {
-    /// Begins a row: what is added from here on is its.
+    /// Begins a row, to which all later figures belong.
     pub fn begin(&mut self, row: &'static str) {
         self.row = row;
     }
 
-    /// Adds a round's value to a figure. `floor` names the figure of the same row that it stands beside.
+    /// Adds a round's value to a figure. `floor` names the figure of the same row with which it is compared.
     pub fn add(&mut self, name: &str, unit: &'static str, floor: Option<&str>, value: f64) {
         self.figure(name, unit, floor).push(value);
     }
 
-    /// Adds a round's latencies to a figure. A round without any is none.
+    /// Adds a round's latencies to a figure. A round without latencies does not count.
     pub fn record(&mut self, name: &str, floor: Option<&str>, latency: &Latency) {
         if latency.is_empty() {
             return;
@@ -81,14 +81,14 @@ impl Board {
         figure.latency = Some(pooled.percentiles());
     }
 
-    /// Adds something that a reader must know.
+    /// Adds a note for the reader.
     pub fn remark(&mut self, remark: String) {
         if !self.remarks.contains(&remark) {
             self.remarks.push(remark);
         }
     }
 
-    /// Adds what was asked of the machine by a measuring process.
+    /// Adds the privileges that a measuring process requested.
     pub(super) fn granted(&mut self, grants: Vec<Grant>) {
         for grant in grants {
             if !self.grants.contains(&grant) {
@@ -97,23 +97,23 @@ impl Board {
         }
     }
 
-    /// What was measured, in the order in which it was begun.
+    /// Returns the figures, in the order of their first values.
     pub fn figures(&self) -> &[Figure] {
         &self.figures
     }
 
-    /// What a reader must know.
+    /// Returns the notes for the reader.
     pub fn remarks(&self) -> &[String] {
         &self.remarks
     }
 
-    /// The figure of this name.
+    /// Returns the figure of this name.
     pub fn find(&self, row: &str, name: &str) -> Option<&Figure> {
         self.figures.iter().find(|figure| figure.row == row && figure.name == name)
     }
 
-    /// One figure over another. Of the medians of rounds: the median of the quotients of neighbouring rounds, since these
-    /// had the machine in the same state.
+    /// Returns the ratio of two figures. For values per round it is the median of the ratios of neighbouring rounds, because these
+    /// found the machine in the same state.
     pub fn ratio(&self, row: &str, over: &str, under: &str) -> Option<f64> {
         let (over, under) = (self.find(row, over)?, self.find(row, under)?);
         let ratio = match (&over.latency, &under.latency) {
@@ -146,7 +146,7 @@ impl Board {
         &mut self.figures[index]
     }
 
-    /// Computes what every figure is to the one that it stands beside, once all are there.
+    /// Compares every figure with its lower bound, once all figures are complete.
     pub(super) fn compare(&mut self) {
         for index in 0..self.figures.len() {
             let figure = &self.figures[index];
@@ -164,10 +164,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_ratio_of_rounds_is_that_of_neighbours() {
+    fn a_ratio_compares_neighbouring_rounds() {
         let mut board = Board::default();
         board.begin("step");
-        // The machine slows down by ten in the midst: the medians alone would say anything.
+        // The machine slows down tenfold halfway, so the ratio of the medians alone would be meaningless.
         for (ours, floor) in [(2.0, 1.0), (2.0, 1.0), (20.0, 10.0)] {
             board.add("ours", "ns", Some("floor"), ours);
             board.add("floor", "ns", None, floor);

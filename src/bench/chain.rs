@@ -1,7 +1,8 @@
-//! The whole chain at several rates, beside the same chain of bare iceoryx2 hops: same cores, same priorities, same waits.
+//! Measures the whole chain at several rates, beside the same chain of bare iceoryx2 hops with the same cores, priorities and
+//! waits.
 //!
-//! From when the leader's tick was due until the controller has sent its command. The follower looks at it when the next
-//! tick is due, by definition, so the hop to it is never waited for.
+//! The latency is from the time at which the leader's tick was due until the controller has sent its command. The follower
+//! applies the command when the next tick is due, so no role waits for that hop.
 
 use super::board::Board;
 use super::exchange::{Mechanism, Opening, Sender, Station, Wake};
@@ -14,12 +15,12 @@ use crate::launch::Outcome;
 use crate::runtime::RoleId;
 
 const RATES_HZ: [u64; 4] = [1000, 5000, 10_000, 20_000];
-/// Words of the bare samples: 128 bytes, as much as a measurement takes, and an estimate nearly.
+/// Words of the bare samples: 128 bytes, the size of a measurement and nearly that of an estimate.
 const WORDS: usize = 16;
-/// `launch.processes`: each role in a process of its own; both of the performance-critical step in one.
+/// Values of `launch.processes`: each role in its own process; observer and controller, the critical path, in one.
 pub(super) const APART: &str = "[]";
 const ESTIMATE_AND_CONTROL: &str = "[['observer', 'controller']]";
-/// Until the first sample of a round is due, ns.
+/// The time until the first sample of a round is due, ns.
 const START_NS: u64 = 20_000_000;
 
 /// Measures the row.
@@ -69,7 +70,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     Ok(())
 }
 
-/// The latencies of a stage of a role.
+/// Returns the latencies of a role's stage.
 pub(super) fn stages<'a>(
     outcome: &'a Outcome,
     role: &'a str,
@@ -79,14 +80,14 @@ pub(super) fn stages<'a>(
     of_role.flat_map(|report| &report.stages).filter(move |found| found.stage == stage).map(|found| found.latency())
 }
 
-/// A run of the scenario in real time, with these roles in one process.
+/// Runs the scenario in real time with this value of `launch.processes`.
 pub(super) fn run_live(bench: &Bench<'_>, hz: u64, seconds: f64, processes: &str) -> Result<Outcome, BenchError> {
     let (hz, seconds) = (format!("tick_hz={hz}.0"), format!("duration_s={seconds:?}"));
     let scenario = bench.scenario(&[&hz, &seconds, "clock=realtime", &format!("launch.processes={processes}")])?;
     bench.launch(&scenario, bench.signal, &mut |_| {})
 }
 
-/// Bare hops in a row: this process in the leader's place, a peer in the observer's, one in the controller's.
+/// Two bare hops in sequence. This process has the leader's privileges, one peer the observer's, the other the controller's.
 struct RawChain {
     sender: Sender,
     relay: Peer,

@@ -1,6 +1,6 @@
-//! The ways in which two processes can exchange a sample, ours among them, behind one trait: what the hop row compares.
+//! The compared mechanisms of exchanging a sample between two processes, including this program's bus, behind one trait.
 //!
-//! Every way carries the same words and is used as a plain, careful program would use it. Must not know what is measured.
+//! Every mechanism carries the same words and is used as a plain, careful program would use it. Must not know the measurements.
 
 use super::page::Page;
 use super::session::BenchError;
@@ -17,23 +17,23 @@ use std::time::Duration;
 
 /// The most words of a sample.
 const MAX_WORDS: usize = 32;
-/// Words of a sample that are its stamp.
+/// Words of a sample's stamp.
 const STAMP: usize = 4;
 /// The generation of all samples.
 const GENERATION: u64 = 1;
-/// How long one who spun for too long sleeps between two looks, ns.
+/// The sleep between two polls of a receiver that has spun for too long, ns.
 const NAP_NS: u64 = 50_000;
-/// How long a sleeper sleeps at most before it looks whether it is to give up, ns.
+/// The longest sleep before a receiver checks its timeout, ns.
 const SLEEP_NS: u64 = 1_000_000_000;
-/// How often one who spins looks at the clock: a partner that is gone must not leave a real-time process spinning.
+/// Polls between two clock reads of a spinning receiver: a real-time process must not spin forever for a dead partner.
 const POLLS: u32 = 1024;
-/// How long after the end of its spin one who only spins goes on, ns.
+/// The extra spin time of a receiver that never sleeps on a notifier, ns.
 const PATIENCE_NS: u64 = 5_000_000;
 
-/// How a sample is carried, and what wakes a receiver that sleeps.
+/// The transport of a sample, with the notifier that wakes a sleeping receiver.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub(super) enum Mechanism {
-    /// Our bus.
+    /// This program's bus.
     Ours,
     /// iceoryx2 publish-subscribe, and its event.
     Iceoryx,
@@ -43,7 +43,7 @@ pub(super) enum Mechanism {
     Udp,
 }
 
-/// How a receiver waits.
+/// The way in which a receiver waits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub(super) enum Wake {
     /// Polls, from shortly before the sample is due.
@@ -76,69 +76,69 @@ impl Mechanism {
     }
 }
 
-/// What a sample says, where our samples have their stamp: number, generation, when due, when sent. The other words repeat
-/// the number, so that a torn one is seen.
+/// The content of a sample. Its words are number, generation, due time and sent time, in the place of the stamp; all others repeat
+/// the number, so that a torn sample is detected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Content {
-    /// From 1.
+    /// The number of the sample, from 1.
     pub number: u64,
-    /// When it was due, ns.
+    /// The due time, ns.
     pub due_ns: u64,
-    /// When it was sent, ns.
+    /// The send time, ns.
     pub sent_ns: u64,
 }
 
-/// Which end of which exchange to open.
+/// The end of an exchange to open.
 #[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
 pub(super) struct Opening {
     pub mechanism: Mechanism,
     pub wake: Wake,
     pub words: usize,
-    /// Names the exchange in its domain.
+    /// The name of the exchange in its domain.
     pub name: String,
     /// 0 from the sender, 1 back to it.
     pub direction: usize,
 }
 
-/// One end that sends.
+/// The sending end of an exchange.
 pub(super) struct Sender {
-    carry: Box<dyn Out>,
+    carry: Box<dyn Output>,
     words: usize,
 }
 
-/// One end that receives.
+/// The receiving end of an exchange.
 pub(super) struct Receiver {
-    carry: Box<dyn In>,
+    carry: Box<dyn Input>,
     words: usize,
     wake: Wake,
-    /// Whether the sender needs the core on which this one polls.
-    gives_way: bool,
+    /// True if the receiver yields between two polls, because the sender needs its core.
+    yields: bool,
 }
 
-trait Out {
+trait Output {
     /// Sends these words.
     fn send(&mut self, words: &[u64]) -> Result<(), BenchError>;
-    /// Gets ready for the next.
+    /// Prepares the next send.
     fn prepare(&mut self) -> Result<(), BenchError> {
         Ok(())
     }
 }
 
-trait In {
-    /// Takes the next words, if they are there. A socket waits for them.
+trait Input {
+    /// Takes the next words, if any. A socket waits for them.
     fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError>;
-    /// Finds the shortest way to a writer that has come.
+    /// Connects directly to a new writer.
     fn refresh(&mut self) {}
-    /// Sleeps until it is notified, where the receiver is opened to sleep.
+    /// Sleeps until a notification, if the receiver was opened to sleep.
     fn sleep(&mut self, _until_ns: u64) -> Result<(), BenchError> {
         Ok(())
     }
 }
 
-/// The node or bus of a process, one per exchange.
+/// A process that takes part in exchanges.
 pub(super) struct Station<'a> {
     pub domain: &'a Domain,
-    /// Makes the names of nodes differ.
+    /// The suffix that makes the names of nodes unique.
     pub process: &'static str,
 }
 
@@ -170,8 +170,8 @@ sample! {
     }
 }
 
-/// Ours: the stamp has the first words.
-impl<S: Sample> Out for IoxWriter<S> {
+/// The bus of this program: the stamp holds the first words.
+impl<S: Sample> Output for IoxWriter<S> {
     #[inline]
     fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
         Write::send(self, |sample: &mut S| {
@@ -185,7 +185,7 @@ impl<S: Sample> Out for IoxWriter<S> {
     }
 }
 
-impl<S: Sample> In for IoxReader<S> {
+impl<S: Sample> Input for IoxReader<S> {
     #[inline]
     fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
         let there = self.advance()?;
@@ -204,10 +204,10 @@ impl<S: Sample> In for IoxReader<S> {
     }
 }
 
-/// A bare end of publish-subscribe, and of the event that wakes a sleeper.
+/// A bare end of publish-subscribe, with that of the event that wakes a sleeper.
 struct Iceoryx<End, Event>(End, Option<Event>);
 
-impl<const WORDS: usize> Out for Iceoryx<RawPublisher<WORDS>, RawNotifier> {
+impl<const WORDS: usize> Output for Iceoryx<RawPublisher<WORDS>, RawNotifier> {
     #[inline]
     fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
         self.0.send(words)?;
@@ -215,7 +215,7 @@ impl<const WORDS: usize> Out for Iceoryx<RawPublisher<WORDS>, RawNotifier> {
     }
 }
 
-impl<const WORDS: usize> In for Iceoryx<RawSubscriber<WORDS>, RawListener> {
+impl<const WORDS: usize> Input for Iceoryx<RawSubscriber<WORDS>, RawListener> {
     #[inline]
     fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
         let there = self.0.receive(|sample| words.copy_from_slice(sample))?;
@@ -235,11 +235,11 @@ struct Mailbox {
     wakes: bool,
     /// The number of the last words received.
     last: u64,
-    /// The count of notifications before the mailbox was last looked into.
+    /// The number of notifications before the last read of the mailbox.
     notified: u32,
 }
 
-impl Out for Mailbox {
+impl Output for Mailbox {
     #[inline]
     fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
         self.page.put(self.direction, words);
@@ -250,7 +250,7 @@ impl Out for Mailbox {
     }
 }
 
-impl In for Mailbox {
+impl Input for Mailbox {
     #[inline]
     fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
         if self.wakes {
@@ -271,7 +271,7 @@ impl In for Mailbox {
     }
 }
 
-impl Out for UdpSocket {
+impl Output for UdpSocket {
     #[inline]
     fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
         let sent = UdpSocket::send(self, bytemuck::cast_slice(words)).map_err(|error| system("send", error))?;
@@ -279,7 +279,7 @@ impl Out for UdpSocket {
     }
 }
 
-impl In for UdpSocket {
+impl Input for UdpSocket {
     #[inline]
     fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
         match self.recv(bytemuck::cast_slice_mut(words)) {
@@ -329,16 +329,16 @@ impl Station<'_> {
         Ok(Mailbox { page, direction: opening.direction, wakes: opening.wake != Wake::Spin, last: 0, notified: 0 })
     }
 
-    /// The file in which a receiver leaves its port.
+    /// Returns the file in which a receiver writes its port.
     fn port(&self, opening: &Opening) -> PathBuf {
         self.domain.shared(&format!("{}.port{}", opening.name, opening.direction))
     }
 
-    /// Opens an end that sends; over UDP the end that receives must be open.
+    /// Opens a sending end; over UDP the receiving end must be open.
     pub fn sender(&self, opening: &Opening) -> Result<Sender, BenchError> {
         let words = opening.words;
         let service = format!("bench/{}/{}", opening.name, opening.direction);
-        let carry: Box<dyn Out> = match opening.mechanism {
+        let carry: Box<dyn Output> = match opening.mechanism {
             Mechanism::Ours => {
                 let (bus, topic) = self.ours(opening)?;
                 match words {
@@ -366,11 +366,11 @@ impl Station<'_> {
         Ok(Sender { carry, words })
     }
 
-    /// Opens an end that receives.
+    /// Opens a receiving end.
     pub fn receiver(&self, opening: &Opening) -> Result<Receiver, BenchError> {
         let (words, wake) = (opening.words, opening.wake);
         let service = format!("bench/{}/{}", opening.name, opening.direction);
-        let carry: Box<dyn In> = match opening.mechanism {
+        let carry: Box<dyn Input> = match opening.mechanism {
             Mechanism::Ours => {
                 let (bus, topic) = self.ours(opening)?;
                 match words {
@@ -395,12 +395,12 @@ impl Station<'_> {
                 Box::new(bind().map_err(BenchError::system("open a socket"))?)
             }
         };
-        Ok(Receiver { carry, words, wake, gives_way: false })
+        Ok(Receiver { carry, words, wake, yields: false })
     }
 }
 
 impl Sender {
-    /// Sends a sample and wakes whoever sleeps; what was sent when is in it.
+    /// Sends a sample with its send time, and wakes a sleeping receiver.
     #[inline]
     pub fn send(&mut self, number: u64, due_ns: u64) -> Result<(), BenchError> {
         let mut words = [number; MAX_WORDS];
@@ -408,29 +408,29 @@ impl Sender {
         self.carry.send(&words[..self.words])
     }
 
-    /// Gets ready for the next sample, off the critical path.
+    /// Prepares the next sample, off the critical path.
     pub fn prepare(&mut self) -> Result<(), BenchError> {
         self.carry.prepare()
     }
 }
 
 impl Receiver {
-    /// Finds the shortest way to a sender that has come, off the critical path.
+    /// Connects directly to a new sender, off the critical path.
     pub fn refresh(&mut self) {
         self.carry.refresh();
     }
 
-    /// Gives way to others of the same priority on the same core while it polls.
-    pub fn give_way(&mut self) {
-        self.gives_way = true;
+    /// Makes it yield, between two polls, to threads of the same priority on the same core.
+    pub fn enable_yield(&mut self) {
+        self.yields = true;
     }
 
-    /// How it waits.
+    /// Returns the way in which it waits.
     pub fn wake(&self) -> Wake {
         self.wake
     }
 
-    /// Waits for the next sample: polls until `spin_end_ns`, then as it does. `None` if there is none by `end_ns`.
+    /// Waits for the next sample: polls until `spin_end_ns`, then continues by its [`Wake`]. Returns `None` without one by `end_ns`.
     ///
     /// # Errors
     /// [`BenchError`]; also if a sample is torn.
@@ -438,22 +438,22 @@ impl Receiver {
     pub fn receive(&mut self, spin_end_ns: u64, end_ns: u64) -> Result<Option<Content>, BenchError> {
         let mut words = [0; MAX_WORDS];
         let words = &mut words[..self.words];
-        let mut polled = 0_u32;
+        let mut polls = 0_u32;
         loop {
             if self.carry.receive(words)? {
                 let whole = words[STAMP..].iter().all(|word| *word == words[0]);
                 let content = Content { number: words[0], due_ns: words[2], sent_ns: words[3] };
                 return if whole { Ok(Some(content)) } else { Err(system("receive", "a sample is torn")) };
             }
-            polled += 1;
-            let polls = match self.wake {
-                Wake::Spin => !polled.is_multiple_of(POLLS) || monotonic_ns() < spin_end_ns + PATIENCE_NS,
+            polls += 1;
+            let spins = match self.wake {
+                Wake::Spin => !polls.is_multiple_of(POLLS) || monotonic_ns() < spin_end_ns + PATIENCE_NS,
                 Wake::Event => false,
                 Wake::Hybrid => monotonic_ns() < spin_end_ns,
             };
-            if polls && self.gives_way {
+            if spins && self.yields {
                 std::thread::yield_now();
-            } else if polls {
+            } else if spins {
                 std::hint::spin_loop();
             } else if monotonic_ns() > end_ns {
                 return Ok(None);

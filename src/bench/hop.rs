@@ -1,7 +1,7 @@
-//! One hop between two processes on two cores, by every mechanism in turn: paced and from when due; back to back besides.
+//! Measures one hop between two processes on two cores, with every mechanism in turn: paced, from the due time, and back to back.
 //!
-//! The sender is this process in the leader's place, the receiver a peer in the controller's. Must not favour
-//! anyone: same cores, same privileges, same samples, same waits.
+//! The sender is this process with the leader's privileges, the receiver a peer with the controller's. Must not favour a
+//! mechanism: same cores, same privileges, same samples, same waits.
 
 use super::board::Board;
 use super::exchange::{Mechanism, Opening, Receiver, Sender, Station, Wake};
@@ -13,16 +13,16 @@ use crate::telemetry::{Grant, Latency};
 
 /// The pace of the open loop: 1 kHz.
 const PERIOD_NS: u64 = 1_000_000;
-/// Until the first sample of a round is due: both ends must have begun to wait.
+/// The time until the first sample of a round is due, ns: both ends must be waiting by then.
 const START_NS: u64 = 5_000_000;
 /// Words of the samples: 64, 128, 256 bytes.
 const SIZES: [usize; 3] = [8, 16, 32];
 
-/// Who takes part, by how the receiver waits.
+/// The compared mechanisms, for receivers that poll first and for those that sleep.
 const POLLED: [Mechanism; 3] = [Mechanism::Ours, Mechanism::Iceoryx, Mechanism::SharedMemory];
 const SLEEPERS: [Mechanism; 4] = [Mechanism::Ours, Mechanism::Iceoryx, Mechanism::SharedMemory, Mechanism::Udp];
 
-/// One way of one size with both of its ends.
+/// Both ends of one exchange, with one mechanism, wait and sample size.
 pub(super) struct Pair {
     name: String,
     floor: Option<String>,
@@ -30,9 +30,9 @@ pub(super) struct Pair {
     back: Receiver,
     peer: Peer,
     number: u64,
-    /// Whether both ends leave their core to others between two looks.
-    gives_way: bool,
-    /// Samples that the next one overtook before the receiver, which was late, looked.
+    /// True if both ends yield their core between two polls.
+    yields: bool,
+    /// Samples that were overwritten by the next one before the late receiver read them.
     lost: u64,
 }
 
@@ -57,7 +57,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     Ok(())
 }
 
-/// Everyone in turn, round after round.
+/// Measures the pairs in turn, round after round.
 fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake: Wake) -> Result<(), BenchError> {
     let (rounds, paced) = (bench.size(8, 1), bench.size(250, 20));
     let exchanges = match wake {
@@ -93,7 +93,7 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake
 }
 
 impl Pair {
-    /// Opens both ends; the peer's is in the observer's place, or the controller's.
+    /// Opens both ends; the peer takes the privileges of the observer, or of the controller.
     pub fn open(
         domain: &Domain,
         observer: bool,
@@ -108,25 +108,25 @@ impl Pair {
         let opening = |direction| Opening { mechanism, wake, words, name: name.clone(), direction };
         let mut peer = Peer::start(domain, observer)?;
         let station = Station { domain, process: "bench" };
-        // Each receiver is open before its sender, which looks for it once.
+        // Each receiver opens before its sender, which looks for it only once.
         let back = station.receiver(&opening(1))?;
         peer.open(opening(0), Some(opening(1)))?;
         let sender = station.sender(&opening(0))?;
-        Ok(Self { name: title(mechanism), floor, sender, back, peer, number: 0, gives_way: false, lost: 0 })
+        Ok(Self { name: title(mechanism), floor, sender, back, peer, number: 0, yields: false, lost: 0 })
     }
 
-    /// Both ends leave their core to others between two looks.
-    pub fn give_way(&mut self) {
-        self.gives_way = true;
-        self.back.give_way();
+    /// Makes both ends yield their core between two polls.
+    pub fn enable_yield(&mut self) {
+        self.yields = true;
+        self.back.enable_yield();
     }
 
-    /// What the peer asked of the machine.
+    /// Takes the peer's privileges, granted or not.
     pub fn grants(&mut self) -> Vec<Grant> {
         std::mem::take(&mut self.peer.grants)
     }
 
-    /// So many samples, each sent when it is due; what the receiver measured, from due and from sent.
+    /// Sends `count` samples, each when it is due. Returns the receiver's latencies from due and from sent, and the lost samples.
     fn paced(&mut self, count: u64) -> Result<([Latency; 2], u64), BenchError> {
         let grid = Grid { epoch_ns: monotonic_ns() + START_NS, period_ns: PERIOD_NS };
         self.peer.receive(grid, self.number + 1, count, false)?;
@@ -134,9 +134,9 @@ impl Pair {
         self.peer.received()
     }
 
-    /// So many samples there and back without a pause: half of the mean round trip, µs.
+    /// Sends `count` samples there and back without a pause. Returns half of the mean round trip, µs.
     pub fn back_to_back(&mut self, count: u64) -> Result<f64, BenchError> {
-        self.peer.echo(count, self.gives_way)?;
+        self.peer.echo(count, self.yields)?;
         self.back.refresh();
         let began_ns = monotonic_ns();
         for _ in 0..count {
@@ -153,22 +153,22 @@ impl Pair {
     }
 }
 
-/// Sends the samples of a grid from tick 1 to `count`, each when it is due, and gives way after each if so told.
+/// Sends the samples of a grid from tick 1 to `count`, each when it is due. If `yields`, yields the core after each.
 pub(super) fn send_paced(
     sender: &mut Sender,
     grid: Grid,
     count: u64,
     number: &mut u64,
-    give_way: bool,
+    yields: bool,
 ) -> Result<(), BenchError> {
     let (before, mut tick) = (*number, 1);
     while tick <= count {
         let now_ns = wait_until(grid.due_ns(tick), lead_ns(grid));
-        // As a role does: what is late is skipped, never made up for in a burst. The receiver misses its number.
+        // As in a role, late ticks are skipped, never sent in a burst. The receiver counts the missing numbers.
         tick = grid.tick_at(now_ns).clamp(tick, count);
         sender.send(before + tick, grid.due_ns(tick))?;
-        if give_way {
-            // Who waits for it waits for this core too.
+        if yields {
+            // The receiver waits for this core too.
             std::thread::yield_now();
         }
         sender.prepare()?;

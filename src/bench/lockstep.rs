@@ -1,5 +1,5 @@
-//! Ticks per second where nobody waits for the time: as processes in lockstep, and in one thread; beside the hops and the
-//! arithmetic that they cannot do without.
+//! Measures ticks per second without real time: as processes in lockstep, and in one thread. The lower bounds are the raw hops
+//! and the arithmetic alone.
 
 use super::board::Board;
 use super::exchange::{Mechanism, Wake};
@@ -14,9 +14,9 @@ use std::sync::Barrier;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-/// What ends a run in order.
+/// The signal that ends a run in an orderly way.
 const SIGTERM: usize = 15;
-/// Hops in a row that a lockstep tick waits for: a follower's measurement to the controller, the command back to it.
+/// Sequential hops per lockstep tick: a follower's measurement to the controller, and the command back.
 const HOPS: f64 = 2.0;
 /// Words of the bare samples, as in the row `chain`.
 const WORDS: usize = 16;
@@ -29,7 +29,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     let all: Result<Vec<_>, _> =
         bench.scenarios.iter().map(|known| Ok::<_, BenchError>((known.0, resolve(*known, &alone)?))).collect();
     let all = all?;
-    // Without a controller nobody waits for a command.
+    // Without a controller no role waits for a command.
     let floor = RoleId::all(&measured).contains(&RoleId::Controller).then_some("two raw hops back to back");
     let arithmetic = format!("arithmetic alone, {}", bench.scenarios[0].0);
     let hashed = format!("arithmetic, truths and hashes, {}", bench.scenarios[0].0);
@@ -82,19 +82,19 @@ fn ticks_per_second(bench: &Bench<'_>, scenario: &Scenario, limit: Duration) -> 
     let whole = began.elapsed();
     Ok(match seen {
         Some([(first, from), (last, to)]) if last > first => (last - first) as f64 / (to - from).as_secs_f64(),
-        // A run too short to be looked at twice: its start and stop count too.
+        // A run that is too short for two observations: its start and stop count too.
         _ => scenario.last_tick as f64 / whole.as_secs_f64(),
     })
 }
 
-/// Ticks per second of bare processes in the places of four roles, which share their cores as those do: two pairs at once, leader and
-/// observer, follower and controller, exchange a sample there and back, and nobody computes anything.
+/// Measures ticks per second of bare processes with the privileges and cores of four roles, without computation: two pairs at once,
+/// leader with observer and follower with controller, exchange a sample there and back.
 fn four_raw(scenario: &Scenario, exchanges: u64) -> Result<f64, BenchError> {
     let domain = OwnedDomain::create(0)?;
     let domain = domain.domain();
     let open = |observer| {
         let mut pair = Pair::open(domain, observer, Mechanism::Iceoryx, Wake::Spin, WORDS)?;
-        pair.give_way();
+        pair.enable_yield();
         Ok::<_, BenchError>(pair)
     };
     let ready = Barrier::new(2);
@@ -108,9 +108,9 @@ fn four_raw(scenario: &Scenario, exchanges: u64) -> Result<f64, BenchError> {
         let pair = open(true);
         ready.wait();
         let began = Instant::now();
-        let led = pair.and_then(|mut pair| pair.back_to_back(exchanges));
-        let followed = follower.join().map_err(|_| BenchError::Peer("a thread panicked".to_owned()))?;
-        led.and(followed)?;
+        let leader = pair.and_then(|mut pair| pair.back_to_back(exchanges));
+        let follower = follower.join().map_err(|_| BenchError::Peer("a thread panicked".to_owned()))?;
+        leader.and(follower)?;
         Ok(exchanges as f64 / began.elapsed().as_secs_f64())
     })
 }

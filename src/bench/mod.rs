@@ -1,9 +1,9 @@
-//! The benchmark of a program with rigs: what it costs on this machine beside its floors, everything in one run.
+//! The benchmark of a program with rigs: its costs on this machine, compared with their lower bounds in the same run.
 //!
-//! Contestants that are compared take turns in short rounds (A B A B …), so that whatever disturbs the machine disturbs all
-//! of them. Nothing is removed: medians are those of all rounds, percentiles those of all values. A latency is measured from
-//! when the sample was due, at a paced, open-loop tick; back-to-back exchange is an extra figure. Must not know what a good
-//! result is (`targets.rs` does), and must not judge by anything that this run has not measured.
+//! Compared candidates take turns in short rounds (A B A B …), so that a disturbance of the machine affects all of them. No value
+//! is removed: medians cover all rounds, percentiles all values. A latency is measured from the time at which the sample was
+//! due, at a paced, open-loop tick; back-to-back exchange is an extra figure. Must not contain targets (`targets.rs` does), and
+//! must not judge by anything that this run has not measured.
 
 mod board;
 mod chain;
@@ -29,7 +29,7 @@ pub use targets::{Bound, Of, Target, Verdict, target};
 
 use crate::telemetry::Grant;
 
-/// What a user measures on a machine.
+/// The rows of the benchmark.
 pub const ROWS: &[Row] = &[
     row("hop", "one hop between two processes on two cores", targets::HOP, hop::measure),
     row("chain", "leader -> observer -> controller: from tick to command sent", targets::CHAIN, chain::measure),
@@ -45,7 +45,7 @@ pub const ROWS: &[Row] = &[
     row("processor", "processor time per tick of every role, by how roles wait", &[], processor::measure),
 ];
 
-/// Measures the rows. One that this program's scenario does not go with is a remark on the board.
+/// Measures the rows. A row that this program's scenario does not support becomes a remark on the board.
 ///
 /// # Errors
 /// [`BenchError`].
@@ -59,8 +59,8 @@ pub fn run(bench: &mut Bench<'_>) -> Result<(Board, Vec<Grant>), BenchError> {
             measured => measured?,
         }
     }
-    let taken = std::mem::take(&mut board.grants);
-    Ok((board, [grants, taken].concat()))
+    let peer_grants = std::mem::take(&mut board.grants);
+    Ok((board, [grants, peer_grants].concat()))
 }
 
 #[cfg(test)]
@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_scenario_does_not_go_with_is_named_and_not_measured() {
+    fn an_unsupported_row_is_a_remark_and_is_not_measured() {
         let (_, text) = SHIPPED.iter().find(|(name, _)| *name == "orbit-rendezvous").unwrap();
         let mut free: toml::Table = text.parse().unwrap();
         free.retain(|key, _| !["controller", "follower"].contains(&key));
@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn what_disturbs_or_outlasts_a_short_run_is_left_out() {
+    fn faults_and_external_roles_are_removed_from_the_scenario() {
         let (_, text) = SHIPPED.iter().find(|(name, _)| *name == "faults").unwrap();
         let text = text.replace("\n[watchdog]", "\n[launch]\nexternal = [\"follower\"]\n[watchdog]");
         assert!(resolve(("disturbed", &text), &[]).is_ok_and(|whole| !whole.faults.is_empty()));

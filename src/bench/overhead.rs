@@ -1,7 +1,7 @@
-//! What a tick takes of the system in the steady state of a real run: faults and switches as the kernel counts them per
-//! process, system calls by perf or strace, allocations by a preloaded counter.
+//! Measures the system overhead per tick in the steady state of a real run: the kernel's counts of faults and context switches per
+//! process, system calls by perf or strace, and allocations by a preloaded counter.
 //!
-//! Counts that do not disturb each other are taken in one run; whoever watches system calls gets a run of its own.
+//! Counts that do not disturb each other come from one run; system calls are counted in a separate run.
 
 use super::board::Board;
 use super::session::{Bench, BenchError};
@@ -13,12 +13,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// The allocator that counts.
+/// The counting allocator.
 const ALLOCATIONS: &str = include_str!("allocations.c");
-/// Between two words of a role to the launcher, s; each is a sample too.
-const WORD_S: f64 = 0.02;
+/// The time between two heartbeats of a role, s; each is a sample too.
+const HEARTBEAT_S: f64 = 0.02;
 
-/// What the kernel and the allocator have counted of a process so far.
+/// The counts of a process so far, by the kernel and the allocator.
 #[derive(Debug, Clone, Copy)]
 struct Counts {
     faults: u64,
@@ -28,9 +28,9 @@ struct Counts {
 }
 
 impl Counts {
-    fn of(pid: i32, allocations: &Path) -> Option<Self> {
+    fn read(pid: i32, allocations: &Path) -> Option<Self> {
         let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-        // After the name, which may hold anything, in parentheses: state is field 3, minor faults 10, major ones 12.
+        // After the name in parentheses, which may hold any text: state is field 3, minor faults 10, major faults 12.
         let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
         let field = |number: usize| fields.get(number - 3)?.parse::<u64>().ok();
         let counted = fs::read(allocations.join(pid.to_string())).ok();
@@ -55,7 +55,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     Ok(())
 }
 
-/// A run with the window in its midst, and time for whoever counts to begin and to end.
+/// Runs the scenario with the window in its middle, and with time for the counters to start and to stop.
 fn watch(
     bench: &mut Bench<'_>,
     window: Duration,
@@ -66,7 +66,7 @@ fn watch(
     Watch { overrides: &[&duration, "clock=realtime"], environment, midway }.run(bench).map(|_| ())
 }
 
-/// Faults, switches and allocations.
+/// Counts faults, context switches and allocations.
 fn count(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(), BenchError> {
     let scenario = bench.scenario(&[])?;
     let directory = tempfile::tempdir().map_err(BenchError::system("make a temporary directory"))?;
@@ -78,15 +78,15 @@ fn count(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
         }
         Err(reason) => board.remark(format!("allocations are not counted: {reason}")),
     }
-    let (mut counted, mut words) = (Vec::new(), 0.0);
+    let (mut counted, mut heartbeats) = (Vec::new(), 0.0);
     watch(bench, window, environment, &mut |processes, period_ns| {
-        words = period_ns as f64 / 1e9 / WORD_S;
-        let look = |process: &Process| Counts::of(process.pid, directory.path());
+        heartbeats = period_ns as f64 / 1e9 / HEARTBEAT_S;
+        let counts = |process: &Process| Counts::read(process.pid, directory.path());
         let began = Instant::now();
-        let before: Vec<_> = processes.iter().map(look).collect();
+        let before: Vec<_> = processes.iter().map(counts).collect();
         std::thread::sleep(window);
         let ticks = began.elapsed().as_nanos() as f64 / period_ns as f64;
-        let after = processes.iter().map(look);
+        let after = processes.iter().map(counts);
         let pairs = processes.iter().cloned().zip(before).zip(after);
         counted = pairs.filter_map(|((process, before), after)| Some((process, before?, after?, ticks))).collect();
     })?;
@@ -99,13 +99,13 @@ fn count(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
         add("voluntary context switches", per_tick(before.voluntary, after.voluntary));
         add("involuntary context switches", per_tick(before.involuntary, after.involuntary));
         let Some(role) = RoleId::named(&scenario, &process.name) else { continue };
-        // iceoryx2 allocates once for each.
+        // iceoryx2 allocates once per sample.
         let samples = ports(&scenario, role).writes.len() as f64;
         worst_faults = worst_faults.max(faults);
         if let (Some(before), Some(after)) = (before.allocations, after.allocations) {
             let all = per_tick(before, after);
             add("allocations", all);
-            worst_allocations = worst_allocations.max((all - samples - words).max(0.0));
+            worst_allocations = worst_allocations.max((all - samples - heartbeats).max(0.0));
         }
     }
     for (name, value) in [
@@ -119,7 +119,7 @@ fn count(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
     Ok(())
 }
 
-/// The allocator that counts, compiled for this machine; or why there is none.
+/// Compiles the counting allocator, or returns the reason why it cannot.
 fn compile_allocator(directory: &Path) -> Result<PathBuf, String> {
     let [input, output] = ["allocations.c", "allocations.so"].map(|name| directory.join(name));
     fs::write(&input, ALLOCATIONS).map_err(|error| format!("cannot write {}: {error}", input.display()))?;
@@ -132,7 +132,7 @@ fn compile_allocator(directory: &Path) -> Result<PathBuf, String> {
     }
 }
 
-/// System calls, by whatever can count them here.
+/// Counts system calls with perf if it works here, else with strace.
 fn calls(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(), BenchError> {
     let (mut counted, by_perf) = (Vec::new(), perf_works());
     watch(bench, window, Vec::new(), &mut |processes, period_ns| {
@@ -148,7 +148,7 @@ fn calls(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
     for (process, calls, ticks) in counted {
         match calls {
             Ok(Calls { all, waits }) => {
-                // The counters of a process do not begin at quite the same instant.
+                // The counters of a process do not start at exactly the same time.
                 let beyond_waits = all.saturating_sub(waits) as f64 / ticks;
                 let all = all as f64 / ticks;
                 board.add(&format!("system calls, {}", process.name), "per tick", None, all);
@@ -167,35 +167,35 @@ fn calls(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
     Ok(())
 }
 
-/// System calls of a process, and those of them that wait or wake.
+/// The number of system calls of a process, and of those that wait or wake.
 struct Calls {
     all: u64,
     waits: u64,
 }
 
-/// Calls that wait for the time or another role, or wake one.
+/// System calls that wait for a time or another role, or wake one.
 const WAITS: [&str; 3] = ["clock_nanosleep", "futex", "sched_yield"];
 
-/// What perf is to count.
+/// Returns the events for perf to count.
 fn events() -> String {
     let waits = WAITS.iter().map(|call| format!(",syscalls:sys_enter_{call}"));
     std::iter::once("raw_syscalls:sys_enter".to_owned()).chain(waits).collect()
 }
 
-/// Whether there is a perf that may count system calls.
+/// Returns true if perf is installed and may count system calls.
 fn perf_works() -> bool {
     let tried = Command::new("perf").args(["stat", "-e", &events(), "true"]).stdin(Stdio::null()).output();
     tried.is_ok_and(|done| done.status.success())
 }
 
-/// A program that counts the system calls of a process for a while.
+/// A program that counts the system calls of a process for some time.
 enum Watcher {
     Perf(std::process::Child),
     Strace(std::process::Child),
 }
 
 impl Watcher {
-    /// Starts perf, which hardly disturbs; or strace, which does.
+    /// Starts perf, which hardly disturbs the process, or strace, which does.
     fn start(pid: i32, window: Duration, by_perf: bool) -> Result<Self, String> {
         let (seconds, pid) = (format!("{:?}", window.as_secs_f64()), pid.to_string());
         let mut command = Command::new(if by_perf { "perf" } else { "timeout" });
@@ -219,7 +219,7 @@ impl Watcher {
     }
 }
 
-/// `count,,event,…` per line.
+/// Parses lines of `count,,event,…`.
 fn parse_perf(text: &str) -> Option<Calls> {
     let counts = text.lines().filter_map(|line| {
         let mut fields = line.split(',');
@@ -232,7 +232,7 @@ fn parse_perf(text: &str) -> Option<Calls> {
     Some(Calls { all, waits })
 }
 
-/// `% time seconds usecs/call calls [errors] syscall` per line.
+/// Parses lines of `% time seconds usecs/call calls [errors] syscall`.
 fn parse_strace(text: &str) -> Option<Calls> {
     let mut calls = Calls { all: 0, waits: 0 };
     for line in text.lines() {

@@ -1,6 +1,6 @@
-//! Shared memory between a sender and a receiver: two mailboxes and two futexes, the least that two processes need.
+//! Shared memory between a sender and a receiver: two mailboxes and two futexes, the minimum for two processes.
 //!
-//! Every access is atomic; nobody locks. Must not outlive its domain: the files are two of the domain's.
+//! Every access is atomic, without locks. Must not outlive its domain, to which its two files belong.
 
 use crate::shared::{SharedHalves, SharedWords};
 use rustix::thread::futex;
@@ -8,13 +8,13 @@ use std::io;
 use std::path::Path;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering, fence};
 
-/// Words of one mailbox with what belongs to it, a multiple of a cache line's.
+/// Words of one mailbox with its number, a multiple of a cache line.
 const BOX_WORDS: usize = 64;
-/// Where a mailbox has its number and the samples' words: each on cache lines of its own.
+/// Offsets of a mailbox's number and of the sample's words, on separate cache lines.
 const NUMBER: usize = 0;
 const CONTENT: usize = 16;
-/// Futexes are a cache line apart.
-const BELL_STRIDE: usize = 16;
+/// The distance between futexes, half words: one cache line.
+const FUTEX_STRIDE: usize = 16;
 
 /// The mapped mailboxes and futexes.
 #[derive(Debug)]
@@ -24,13 +24,13 @@ pub(super) struct Page {
 }
 
 impl Page {
-    /// Maps the mailboxes at a path and the futexes beside them, made if they are not there.
+    /// Maps the mailboxes at a path and the futexes beside them; creates missing files.
     pub fn open(path: &Path) -> io::Result<Self> {
         let mut futexes = path.as_os_str().to_owned();
         futexes.push("_bells");
         Ok(Self {
             boxes: SharedWords::open(path, 2 * BOX_WORDS)?,
-            futexes: SharedHalves::open(futexes.as_ref(), 2 * BELL_STRIDE)?,
+            futexes: SharedHalves::open(futexes.as_ref(), 2 * FUTEX_STRIDE)?,
         })
     }
 
@@ -41,7 +41,7 @@ impl Page {
 
     #[inline]
     fn futex(&self, direction: usize) -> &AtomicU32 {
-        &self.futexes.halves()[(direction & 1) * BELL_STRIDE]
+        &self.futexes.halves()[(direction & 1) * FUTEX_STRIDE]
     }
 
     /// Puts words into the mailbox of a direction.
@@ -53,7 +53,7 @@ impl Page {
         self.word(direction, NUMBER).store(words[0], Ordering::Release);
     }
 
-    /// Takes words out, if their first is not `last`; they must be taken before the next are put.
+    /// Takes the words, if their first is not `last`; they must be taken before the next are put.
     #[inline]
     pub fn take(&self, direction: usize, last: u64, words: &mut [u64]) -> bool {
         if self.word(direction, NUMBER).load(Ordering::Acquire) == last {
@@ -74,7 +74,7 @@ impl Page {
         Ok(())
     }
 
-    /// How often the futex of a direction was notified; to be read before the mailbox is looked into.
+    /// Returns the number of notifications of a direction's futex; call it before reading the mailbox.
     #[inline]
     pub fn notified(&self, direction: usize) -> u32 {
         let notified = self.futex(direction).load(Ordering::Acquire);
@@ -85,9 +85,9 @@ impl Page {
     /// Waits until the futex was notified more often than `notified`.
     #[inline]
     pub fn wait(&self, direction: usize, notified: u32) {
-        let at_most = rustix::time::Timespec { tv_sec: 1, tv_nsec: 0 };
-        // Rung meanwhile, interrupted or late: the caller looks again.
-        let _ = futex::wait(self.futex(direction), futex::Flags::empty(), notified, Some(&at_most));
+        let timeout = rustix::time::Timespec { tv_sec: 1, tv_nsec: 0 };
+        // After a notification, an interruption or the timeout, the caller reads the mailbox again.
+        let _ = futex::wait(self.futex(direction), futex::Flags::empty(), notified, Some(&timeout));
     }
 }
 
@@ -96,7 +96,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_put_is_taken_once() {
+    fn words_are_taken_once() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("page");
         let (here, there) = (Page::open(&path).unwrap(), Page::open(&path).unwrap());

@@ -1,7 +1,7 @@
-//! The other end of a hop: a process of its own, this program again, that receives, echoes or passes on what it is sent.
+//! The other end of a hop: a separate process of this program that receives, echoes or forwards samples.
 //!
-//! Asks for the same privileges as the role whose place it has. Takes its orders as lines of JSON on standard input and
-//! answers on standard output, never while it measures. Dies with its parent.
+//! It requests the privileges of the role that it stands for. It reads orders as lines of JSON from standard input and answers
+//! on standard output, never during a measurement. It ends with its parent.
 
 use super::exchange::{Opening, Receiver, Sender, Station, Wake, system};
 use super::session::BenchError;
@@ -19,44 +19,44 @@ use std::process::{Child, ChildStdin, Stdio};
 use std::sync::mpsc::{Receiver as Lines, channel};
 use std::time::Duration;
 
-/// How long before a sample is due both ends wake, as roles do, ns.
+/// The time before a sample is due at which both ends wake, as in roles, ns.
 const LEAD_NS: u64 = 60_000;
-/// How long one who spins and then sleeps spins after the sample was due, ns.
+/// The spin time after a sample was due, before a receiver sleeps, ns.
 pub(super) const SPIN_NS: u64 = 50_000;
-/// A sample that has not come for so long is lost, ns.
+/// The time after which a missing sample counts as lost, ns.
 pub(super) const LOST_NS: u64 = 1_000_000_000;
-/// A peer that has said nothing for so long hangs.
+/// The time without an answer after which a peer counts as hung.
 const WATCHDOG: Duration = Duration::from_secs(60);
 
-/// What a peer is asked to do.
+/// An order to a peer.
 #[derive(Debug, Serialize, Deserialize)]
 enum Order {
     /// Open these ends: one to read from, one to write to.
     Open { inlet: Opening, outlet: Option<Opening> },
-    /// Receive so many samples that are due on a grid, the first of this number; if so told, pass them on.
+    /// Receive `count` samples that are due on a grid, beginning with number `first`; if `pass_on`, forward them.
     Receive { epoch_ns: u64, period_ns: u64, first: u64, count: u64, pass_on: bool },
-    /// Send every one of so many samples back at once; if so told, leave the core to others between two looks.
+    /// Send each of `count` samples back at once; if `give_way`, yield the core between two polls.
     Echo { count: u64, give_way: bool },
 }
 
-/// What it answers.
+/// An answer of a peer.
 #[derive(Debug, Serialize, Deserialize)]
 enum Answer {
-    /// It is there, with these privileges.
+    /// The peer has started, with these privileges.
     Here(Vec<Grant>),
     /// The ends are open.
     Open,
-    /// Received: from when due, from when sent; and how many were overtaken by the next.
+    /// The samples are received: latencies from due and from sent, and the number of lost samples.
     Received { due: StageReport, sent: StageReport, lost: u64 },
-    /// All are echoed.
+    /// All samples are echoed.
     Echoed,
 }
 
-/// Serves as a peer of the benchmark in this domain until standard input ends, in the place of the observer of this scenario,
-/// beside the leader where cores are few; else of the controller.
+/// Serves as a peer of the benchmark in this domain until standard input ends. It takes the privileges of the scenario's observer,
+/// which shares the leader's core if cores are few, or else of the controller.
 ///
 /// # Errors
-/// Why it cannot, in words.
+/// The reason as text.
 pub fn serve_peer(domain: &Path, scenario: &Scenario, observer: bool) -> Result<(), String> {
     let domain = Domain::join(domain).map_err(|error| error.to_string())?;
     let (role, waits_for) = match observer {
@@ -64,28 +64,32 @@ pub fn serve_peer(domain: &Path, scenario: &Scenario, observer: bool) -> Result<
         false => (RoleId::Controller, RoleId::Observer),
     };
     let Privileges { grants, co_located, .. } = take_privileges(scenario, role);
-    say(&Answer::Here(grants))?;
+    send_answer(&Answer::Here(grants))?;
     let mut ends = None;
     for line in std::io::stdin().lock().lines() {
         let line = line.map_err(|error| error.to_string())?;
         let order: Order = serde_json::from_str(&line).map_err(|error| error.to_string())?;
         ends.iter_mut().for_each(|(receiver, _): &mut (Receiver, _)| receiver.refresh());
-        let answer = obey(&order, &domain, &mut ends).map_err(|error| error.to_string())?;
+        let answer = execute(&order, &domain, &mut ends).map_err(|error| error.to_string())?;
         if let (Some((receiver, _)), true) = (&mut ends, co_located.contains(&waits_for)) {
-            receiver.give_way();
+            receiver.enable_yield();
         }
-        say(&answer)?;
+        send_answer(&answer)?;
     }
     Ok(())
 }
 
-fn say(answer: &Answer) -> Result<(), String> {
+fn send_answer(answer: &Answer) -> Result<(), String> {
     let line = serde_json::to_string(answer).map_err(|error| error.to_string())?;
     let mut stdout = std::io::stdout().lock();
     writeln!(stdout, "{line}").and_then(|()| stdout.flush()).map_err(|error| error.to_string())
 }
 
-fn obey(order: &Order, domain: &Domain, ends: &mut Option<(Receiver, Option<Sender>)>) -> Result<Answer, BenchError> {
+fn execute(
+    order: &Order,
+    domain: &Domain,
+    ends: &mut Option<(Receiver, Option<Sender>)>,
+) -> Result<Answer, BenchError> {
     match (order, ends) {
         (Order::Open { inlet, outlet }, ends) => {
             let station = Station { domain, process: "peer" };
@@ -100,7 +104,7 @@ fn obey(order: &Order, domain: &Domain, ends: &mut Option<(Receiver, Option<Send
         }
         (Order::Echo { count, give_way }, Some((receiver, Some(sender)))) => {
             if *give_way {
-                receiver.give_way();
+                receiver.enable_yield();
             }
             for _ in 0..*count {
                 let Some(content) = receiver.receive(monotonic_ns() + SPIN_NS, monotonic_ns() + LOST_NS)? else {
@@ -115,12 +119,12 @@ fn obey(order: &Order, domain: &Domain, ends: &mut Option<(Receiver, Option<Send
     }
 }
 
-/// How long before a sample is due both ends wake: at a short period there must be some sleep left.
+/// Returns the time before a sample is due at which both ends wake; a short period must leave time to sleep.
 pub(super) fn lead_ns(grid: Grid) -> u64 {
     LEAD_NS.min(grid.period_ns / 4)
 }
 
-/// Receives what is due on a grid. A link of the newest sample alone may lose some: to a receiver that is late.
+/// Receives the samples that are due on a grid. A link that holds only the newest sample loses some if the receiver is late.
 fn receive(
     grid: Grid,
     first: u64,
@@ -154,12 +158,12 @@ fn receive(
     Ok(Answer::Received { due: StageReport::new("due", &due), sent: StageReport::new("sent", &sent), lost })
 }
 
-/// A peer as its parent sees it.
+/// The parent's handle of a peer.
 pub(super) struct Peer {
     child: Child,
     orders: Option<ChildStdin>,
     answers: Lines<String>,
-    /// What it asked of the machine.
+    /// The privileges that it requested.
     pub grants: Vec<Grant>,
 }
 
@@ -180,8 +184,8 @@ impl Peer {
             .map_err(BenchError::system("start a measuring peer"))?;
         let (orders, stdout) = (child.stdin.take(), child.stdout.take());
         let (lines, answers) = channel();
-        // Ends with the peer's output.
-        let listen = move || {
+        // The thread ends with the peer's output.
+        let read_answers = move || {
             for line in stdout.into_iter().flat_map(|stdout| BufReader::new(stdout).lines()).map_while(Result::ok) {
                 if lines.send(line).is_err() {
                     break;
@@ -189,51 +193,51 @@ impl Peer {
             }
         };
         let mut peer = Self { child, orders, answers, grants: Vec::new() };
-        std::thread::Builder::new().spawn(listen).map_err(BenchError::system("start a thread"))?;
+        std::thread::Builder::new().spawn(read_answers).map_err(BenchError::system("start a thread"))?;
         match peer.answer()? {
             Answer::Here(grants) => peer.grants = grants,
-            other => return Err(unexpected(&other)),
+            answer => return Err(unexpected(&answer)),
         }
         Ok(peer)
     }
 
     /// Opens the peer's ends.
     pub fn open(&mut self, inlet: Opening, outlet: Option<Opening>) -> Result<(), BenchError> {
-        self.tell(&Order::Open { inlet, outlet })?;
+        self.send_order(&Order::Open { inlet, outlet })?;
         match self.answer()? {
             Answer::Open => Ok(()),
-            other => Err(unexpected(&other)),
+            answer => Err(unexpected(&answer)),
         }
     }
 
-    /// Lets it receive what is due on a grid from tick 1 to `count`, from number `first` on, and pass it on; the answer
-    /// comes later.
+    /// Orders it to receive the samples due on a grid from tick 1 to `count`, beginning with number `first`, and to forward them if
+    /// `pass_on`; [`Self::received`] returns the result.
     pub fn receive(&mut self, grid: Grid, first: u64, count: u64, pass_on: bool) -> Result<(), BenchError> {
-        self.tell(&Order::Receive { epoch_ns: grid.epoch_ns, period_ns: grid.period_ns, first, count, pass_on })
+        self.send_order(&Order::Receive { epoch_ns: grid.epoch_ns, period_ns: grid.period_ns, first, count, pass_on })
     }
 
-    /// What it received: latencies from when due, and from when sent; how many samples were lost.
+    /// Waits for the result of a receive: latencies from due and from sent, and the number of lost samples.
     pub fn received(&mut self) -> Result<([Latency; 2], u64), BenchError> {
         match self.answer()? {
             Answer::Received { due, sent, lost } => Ok(([due.latency(), sent.latency()], lost)),
-            other => Err(unexpected(&other)),
+            answer => Err(unexpected(&answer)),
         }
     }
 
-    /// Lets it echo.
+    /// Orders it to echo.
     pub fn echo(&mut self, count: u64, give_way: bool) -> Result<(), BenchError> {
-        self.tell(&Order::Echo { count, give_way })
+        self.send_order(&Order::Echo { count, give_way })
     }
 
-    /// Waits until everything is echoed.
+    /// Waits until all samples are echoed.
     pub fn echoed(&mut self) -> Result<(), BenchError> {
         match self.answer()? {
             Answer::Echoed => Ok(()),
-            other => Err(unexpected(&other)),
+            answer => Err(unexpected(&answer)),
         }
     }
 
-    fn tell(&mut self, order: &Order) -> Result<(), BenchError> {
+    fn send_order(&mut self, order: &Order) -> Result<(), BenchError> {
         let line = serde_json::to_string(order).map_err(|error| BenchError::Peer(error.to_string()))?;
         let orders = self.orders.as_mut().ok_or_else(|| BenchError::Peer("it takes no orders".to_owned()))?;
         writeln!(orders, "{line}").map_err(|error| BenchError::Peer(error.to_string()))
@@ -251,7 +255,7 @@ fn unexpected(answer: &Answer) -> BenchError {
 
 impl Drop for Peer {
     fn drop(&mut self) {
-        // One that waits for orders ends with them; one that hangs in a receive does not.
+        // A peer that waits for orders ends with them; one that hangs in a receive must be killed.
         self.orders.take();
         let _ = self.child.kill();
         let _ = self.child.wait();

@@ -1,7 +1,7 @@
-//! What a tick takes of the processor, per role and by how roles wait, in whole runs; beside a thread that only sleeps to
+//! Measures the processor time per tick of each role in whole runs, for each wait mode, beside a thread that only sleeps until
 //! each tick.
 //!
-//! The kernel's own account of each process. Must not ask a process of the run for anything.
+//! The values come from the kernel's accounting of each process. Must not query the processes of the run.
 
 use super::board::Board;
 use super::session::{Bench, BenchError};
@@ -11,10 +11,10 @@ use rustix::time::{ClockId, clock_gettime};
 use std::fs;
 use std::time::{Duration, Instant};
 
-/// How roles wait, as `realtime.wake` has it.
+/// The wait modes of roles, as in `realtime.wake`.
 const WAKES: [&str; 3] = ["event", "spin", "auto"];
 const PERIOD_NS: u64 = 1_000_000;
-/// How long before a tick a plant wakes to spin, ns.
+/// The time before a tick at which a plant wakes to spin, ns.
 const LEAD_NS: u64 = 60_000;
 
 /// Measures the row.
@@ -36,11 +36,11 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     Ok(())
 }
 
-/// What each process of a run takes per tick, µs.
+/// Measures the processor time of each process of a run per tick, µs.
 fn per_tick(bench: &mut Bench<'_>, wake: &str, window: Duration) -> Result<Vec<(String, f64)>, BenchError> {
     let duration = format!("duration_s={:?}", window.as_secs_f64() + bench.size(2.0, 1.0));
     let wake = format!("realtime.wake={wake}");
-    let mut taken = Vec::new();
+    let mut used = Vec::new();
     let mut midway = |processes: &[Process], period_ns: u64| {
         let began = Instant::now();
         let before: Vec<_> = processes.iter().map(|process| processor_ns(process.pid)).collect();
@@ -50,24 +50,24 @@ fn per_tick(bench: &mut Bench<'_>, wake: &str, window: Duration) -> Result<Vec<(
             let ns = processor_ns(process.pid)?.checked_sub(before?)?;
             Some((process.name.clone(), ns as f64 / 1e3 / ticks))
         });
-        taken = after.collect();
+        used = after.collect();
     };
     Watch { overrides: &[&duration, "clock=realtime", &wake], environment: Vec::new(), midway: &mut midway }
         .run(bench)?;
-    Ok(taken)
+    Ok(used)
 }
 
-/// The processor time of all threads of a process so far, ns; none if there is no such process or the kernel keeps no account.
+/// Returns the processor time of all threads of a process so far, ns; `None` without such a process or kernel accounting.
 fn processor_ns(pid: i32) -> Option<u64> {
     let tasks = fs::read_dir(format!("/proc/{pid}/task")).ok()?.flatten();
-    let of = |task: fs::DirEntry| {
-        let account = fs::read_to_string(task.path().join("schedstat")).ok()?;
-        account.split_whitespace().next()?.parse::<u64>().ok()
+    let thread_ns = |task: fs::DirEntry| {
+        let schedstat = fs::read_to_string(task.path().join("schedstat")).ok()?;
+        schedstat.split_whitespace().next()?.parse::<u64>().ok()
     };
-    tasks.map(of).sum()
+    tasks.map(thread_ns).sum()
 }
 
-/// What a thread in the leader's place takes that only waits for each tick, with this lead, µs per tick.
+/// Measures the processor time of a thread that only waits for each tick, with the leader's privileges and this lead, µs per tick.
 fn bare(bench: &Bench<'_>, board: &mut Board, ticks: u64, lead_ns: u64) -> Result<f64, BenchError> {
     bench.in_the_leaders_place(board, |_| {
         let grid = Grid { epoch_ns: monotonic_ns() + PERIOD_NS, period_ns: PERIOD_NS };
@@ -86,8 +86,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_process_that_works_has_an_account_and_one_that_is_none_has_not() {
-        // A process of its own: of this one, threads end meanwhile, and their time with them.
+    fn a_busy_process_has_processor_time_and_a_missing_one_has_none() {
+        // A separate process, because the time of this process falls when one of its threads ends.
         let mut busy = std::process::Command::new("sh").args(["-c", "while :; do :; done"]).spawn().unwrap();
         let pid = busy.id() as i32;
         while processor_ns(pid).unwrap() < 10_000_000 {

@@ -1,6 +1,6 @@
 //! The end of a benchmark run: a table for people, JSON for programs, histograms for HdrHistogram's tools.
 //!
-//! Must not compute a figure: what is not on the board is not told.
+//! Must not compute a figure: it reports only figures of the board.
 
 use super::board::{Board, Figure};
 use super::session::{Bench, Row};
@@ -19,34 +19,34 @@ use std::time::SystemTime;
 /// Layout version of `bench.json`.
 const SCHEMA: &str = "corotate/bench/v1";
 
-/// Everything that a benchmark run found out, as it is written to `bench.json`.
+/// The results of a benchmark run, as written to `bench.json`.
 #[derive(Debug, Serialize)]
 pub struct Results {
     schema: &'static str,
     version: &'static str,
     revision: &'static str,
     started_utc: String,
-    /// Whether this was a smoke run, whose figures mean nothing.
+    /// True for a smoke run, whose figures are meaningless.
     pub quick: bool,
     host: MachineInfo,
     /// The scenario that was measured.
     pub scenario: String,
-    /// Why no target is judged; nothing if all are.
+    /// The reasons why no target is judged; empty if all are.
     pub not_judged: Vec<String>,
-    /// Everything that was asked of the machine.
+    /// All requested privileges.
     pub privileges: Vec<Grant>,
-    /// What was measured.
+    /// The measured figures.
     pub figures: Vec<Figure>,
-    /// The targets of the rows that were measured.
+    /// The verdicts on the targets of the measured rows.
     pub targets: Vec<Verdict>,
-    /// What a reader must know.
+    /// Notes for the reader.
     pub remarks: Vec<String>,
     #[serde(skip)]
     rows: Vec<Row>,
 }
 
 impl Results {
-    /// Draws up the results of a run that began at `started`.
+    /// Creates the results of a run that began at `started`.
     pub fn new(bench: &Bench<'_>, mut board: Board, privileges: Vec<Grant>, started: SystemTime) -> Self {
         board.compare();
         let not_judged = bench.unjudged();
@@ -73,13 +73,13 @@ impl Results {
         }
     }
 
-    /// Whether every target that could be judged is met.
+    /// Returns true if every judged target is met.
     pub fn met(&self) -> bool {
         self.targets.iter().all(|verdict| verdict.met != Some(false))
     }
 }
 
-/// The results as text for people.
+/// Returns the results as text.
 pub fn table(results: &Results) -> String {
     let mut text = String::new();
     let host = &results.host;
@@ -157,7 +157,7 @@ fn targets(targets: &[Verdict]) -> comfy_table::Table {
     table
 }
 
-/// Three digits, or as many as there are before the point.
+/// Formats a number with three significant digits, or all its digits before the point.
 fn number(value: f64) -> String {
     let digits = match value.abs() {
         large if large >= 100.0 => 0,
@@ -171,7 +171,7 @@ fn number(value: f64) -> String {
 /// Writes `bench.json`, `bench.txt` and `latency/<row>.<figure>.hgrm` into `directory`, which exists.
 ///
 /// # Errors
-/// Those of the file system.
+/// [`io::Error`] if a file cannot be written.
 pub fn write_results(directory: &Path, results: &Results) -> io::Result<()> {
     files::write(&directory.join("bench.txt"), table(results).as_bytes())?;
     let mut json = BufWriter::new(files::create(&directory.join("bench.json"))?);

@@ -1,4 +1,4 @@
-//! What a whole run takes: to start, to stop, of memory; beside a bare process and a bare node.
+//! Measures start time, stop time and memory of a whole run, beside a bare process and a bare node.
 
 use super::board::Board;
 use super::session::{Bench, BenchError};
@@ -26,7 +26,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         board.add("bare process", "ms", None, bare_process()?);
         board.add("bare iceoryx2 node", "ms", None, bare_node()?);
         let roles = || observed.resident_mib.iter().filter(|(name, _)| *name != "launcher");
-        let largest = |which: usize| roles().map(|(_, mib)| mib[which]).fold(f64::NAN, f64::max);
+        let largest = |index: usize| roles().map(|(_, mib)| mib[index]).fold(f64::NAN, f64::max);
         board.add("memory of the largest role", "MiB", None, largest(0));
         board.add("of it not the program's own file", "MiB", None, largest(1));
         for (name, [mib, _]) in &observed.resident_mib {
@@ -37,7 +37,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     Ok(())
 }
 
-/// This program started, and ended at once, ms.
+/// Measures the time to start this program and wait for its immediate end, ms.
 fn bare_process() -> Result<f64, BenchError> {
     let began = Instant::now();
     let mut command = this_program().map_err(BenchError::system("find this program"))?;
@@ -46,7 +46,7 @@ fn bare_process() -> Result<f64, BenchError> {
     Ok(began.elapsed().as_secs_f64() * 1e3)
 }
 
-/// A node made and dropped in a domain of its own, ms.
+/// Measures the time to create and drop a node in its own domain, ms.
 fn bare_node() -> Result<f64, BenchError> {
     let domain = OwnedDomain::create(0)?;
     let began = Instant::now();

@@ -1,4 +1,4 @@
-//! A benchmark run: what it is to do, and what its rows ask of it.
+//! A benchmark run: its settings, and the services that it offers to its rows.
 
 use super::board::Board;
 use super::targets::Target;
@@ -15,51 +15,51 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 /// A row of a benchmark.
 #[derive(Debug, Clone, Copy)]
 pub struct Row {
-    /// Its name.
+    /// The name of the row.
     pub name: &'static str,
     pub(super) title: &'static str,
-    /// What its figures are held against.
+    /// The targets of its figures.
     pub targets: &'static [Target],
     pub(super) measure: Measure,
 }
 
-/// Measures a row and puts its figures on the board.
+/// A function that measures a row and adds its figures to the board.
 pub type Measure = fn(&mut Bench<'_>, &mut Board) -> Result<(), BenchError>;
 
-/// A row by its name, what it is in words, what its figures are held against, and what measures it.
+/// Creates a row from its name, title, targets and measuring function.
 pub const fn row(name: &'static str, title: &'static str, targets: &'static [Target], measure: Measure) -> Row {
     Row { name, title, targets, measure }
 }
 
-/// What a benchmark run is to do.
+/// The settings of a benchmark run.
 pub struct Bench<'a> {
     /// The rows, in the order of the table.
     pub rows: Vec<Row>,
-    /// A smoke run: every row, a second each, figures that mean nothing.
+    /// True for a smoke run: every row for about a second, with meaningless figures.
     pub quick: bool,
-    /// Its scenarios, name and text; whole runs are of the first.
+    /// The name and text of each scenario; whole runs use the first.
     pub scenarios: &'a [(&'a str, &'a str)],
-    /// The signal that asked the run to end; 0 while none has.
+    /// The number of the signal that ends the run; 0 without one.
     pub signal: &'a AtomicUsize,
-    /// Told what is being measured.
+    /// A callback with the current measurement as text.
     pub progress: &'a mut dyn FnMut(&str),
 }
 
-/// Why a benchmark run failed. Whatever had been started is gone.
+/// The reason why a benchmark run failed. All processes that it started have ended.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum BenchError {
-    /// A signal asked for the end.
+    /// A signal ended the run.
     #[error("ended by signal {0} before everything was measured")]
     Interrupted(usize),
-    /// There is nothing to measure.
+    /// The program has no scenario to measure.
     #[error("this program has no scenario of its own to measure; add one with `Program::scenario`")]
     NoScenario,
-    /// A scenario cannot be run as a row has to run it.
+    /// A row's variant of the scenario is invalid.
     #[error(transparent)]
     #[strum(serialize = "refused-scenario")]
     Scenario(#[from] ConfigError),
-    /// A domain could not be made.
+    /// A domain could not be created.
     #[error(transparent)]
     #[strum(transparent)]
     Domain(#[from] DomainError),
@@ -67,11 +67,11 @@ pub enum BenchError {
     #[error(transparent)]
     #[strum(transparent)]
     Bus(#[from] BusError),
-    /// A run of the product failed.
+    /// A run of the program failed.
     #[error(transparent)]
     #[strum(transparent)]
     Launch(#[from] LaunchError),
-    /// A peer process could not be started, or left.
+    /// A peer process could not be started, or ended early.
     #[error("the measuring peer failed: {0}; its own error is above")]
     #[strum(serialize = "peer-failed")]
     Peer(String),
@@ -79,9 +79,9 @@ pub enum BenchError {
     #[error("cannot {what}: {source}")]
     #[strum(serialize = "system-refused")]
     System {
-        /// What was asked for.
+        /// The refused action.
         what: &'static str,
-        /// Its reason.
+        /// The system's reason.
         source: io::Error,
     },
 }
@@ -92,14 +92,14 @@ impl BenchError {
     }
 }
 
-/// A scenario with these overrides, whatever its run is judged by.
+/// Resolves a scenario with these overrides and without acceptance criteria.
 pub(super) fn resolve((name, text): (&str, &str), overrides: &[&str]) -> Result<Scenario, BenchError> {
     let overrides: Vec<String> = overrides.iter().chain(&["accept={}"]).map(|text| (*text).to_owned()).collect();
     Ok(Scenario::parse(text, &format!("{name}.toml"), &overrides)?)
 }
 
 impl Bench<'_> {
-    /// The scenario that is measured: without faults, unwatched, and with every role started by the launcher.
+    /// Returns the measured scenario: without faults and watchdog, and with every role started by the launcher.
     ///
     /// # Errors
     /// [`BenchError::NoScenario`], [`BenchError::Scenario`].
@@ -108,12 +108,12 @@ impl Bench<'_> {
         resolve(*first, &[overrides, &["fault=[]", "watchdog={}", "launch.external=[]"]].concat())
     }
 
-    /// Whether the scenario is the one whose figures have targets.
+    /// Returns true if the scenario is the one to which the targets apply.
     pub(super) fn has_targets(&self) -> bool {
         self.scenarios.first() == SHIPPED.first()
     }
 
-    /// Why no target is judged; nothing if all are.
+    /// Returns the reasons why no target is judged; empty if all are.
     pub fn unjudged(&self) -> Vec<String> {
         let mut reasons = Vec::new();
         if self.quick {
@@ -129,7 +129,7 @@ impl Bench<'_> {
         reasons
     }
 
-    /// Runs a scenario by this program, until `signal` is one.
+    /// Runs a scenario with this program, until `signal` is set.
     pub(super) fn launch(
         &self,
         scenario: &Scenario,
@@ -142,7 +142,7 @@ impl Bench<'_> {
         Ok(outcome)
     }
 
-    /// Says what comes next.
+    /// Reports the next measurement.
     ///
     /// # Errors
     /// [`BenchError::Interrupted`] if the run is to end.
@@ -152,7 +152,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// An error if the run is to end.
+    /// Returns an error if the run is to end.
     pub(super) fn interrupted(&self) -> Result<(), BenchError> {
         match self.signal.load(Ordering::Relaxed) {
             0 => Ok(()),
@@ -160,15 +160,15 @@ impl Bench<'_> {
         }
     }
 
-    /// One of two sizes: of a run that counts, and of a smoke run.
+    /// Returns the size for a full run, or for a smoke run.
     pub fn size<T>(&self, full: T, quick: T) -> T {
         if self.quick { quick } else { full }
     }
 
-    /// Does something with what the leader asks for, and gives it back; told what was granted.
+    /// Calls `work` with the leader's privileges, then gives them back.
     ///
     /// # Errors
-    /// Those of the work, and [`BenchError`] if there is no scenario.
+    /// The error of `work`, and [`BenchError::NoScenario`] or [`BenchError::Scenario`].
     pub fn in_the_leaders_place<T>(
         &self,
         board: &mut Board,
@@ -180,7 +180,7 @@ impl Bench<'_> {
         board.granted(place.grants.clone());
         let done = work(&place);
         release_priority();
-        // Where it cannot be had back the rest of the suite stays on the leader's core.
+        // If the cores cannot be restored, the rest of the benchmark stays on the leader's core.
         let _ = cores.map(|cores| sched_setaffinity(None, &cores));
         done
     }

@@ -1,44 +1,44 @@
-//! What the rows' figures are held against: the one place where a target of theirs stands.
+//! The targets for the figures of all rows.
 //!
-//! Must not measure anything. A target that could not be measured is neither met nor missed, and says so.
+//! Must not measure anything. A target without a measurement is neither met nor missed.
 
 use super::board::Board;
 use crate::telemetry::Percentiles;
 
-/// Which number of a figure counts.
+/// The statistic of a figure.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Of {
     /// The median of the rounds.
     Median,
-    /// All latencies: half of them are at most this.
+    /// The 50th percentile of all latencies.
     P50,
-    /// 99 %.
+    /// The 99th percentile.
     P99,
-    /// 99.9 %.
+    /// The 99.9th percentile.
     P999,
 }
 
-/// How a figure is to be.
+/// The bound on a figure.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Bound {
-    /// At most.
+    /// An upper bound.
     AtMost(f64),
-    /// At least.
+    /// A lower bound.
     AtLeast(f64),
 }
 
-/// What a figure, or its ratio to another one of its row, is to be.
+/// A target for a figure, or for its ratio to another figure of its row.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Target {
     figure: &'static str,
     over: Option<&'static str>,
-    of: Of,
+    statistic: Of,
     bound: Bound,
 }
 
-/// A figure's, over another one if there is one.
-pub const fn target(figure: &'static str, over: Option<&'static str>, of: Of, bound: Bound) -> Target {
-    Target { figure, over, of, bound }
+/// Creates the target of a figure, or of its ratio to the figure `over`.
+pub const fn target(figure: &'static str, over: Option<&'static str>, statistic: Of, bound: Bound) -> Target {
+    Target { figure, over, statistic, bound }
 }
 
 use Bound::{AtLeast, AtMost};
@@ -76,30 +76,30 @@ pub(super) const OVERHEAD: &[Target] = &[
     target("allocations beyond iceoryx2's one per sample, worst role", None, Median, AtMost(0.01)),
 ];
 
-/// A target with what was measured.
+/// A target with its measured value.
 #[derive(Debug, Clone, serde::Serialize)]
 pub struct Verdict {
     /// The row.
     pub row: &'static str,
-    /// What is to be how, in words.
+    /// The target in words.
     pub what: String,
-    /// What it is; none if it was not measured.
+    /// The measured value; `None` without a measurement.
     pub value: Option<f64>,
     /// The limit.
     pub limit: f64,
-    /// Whether the target is met; none if it was not measured, or is not judged.
+    /// True if the target is met; `None` if it was not measured or is not judged.
     pub met: Option<bool>,
 }
 
 impl Target {
-    /// The verdict on what a board has in a row.
+    /// Judges the figures of a row on the board.
     pub fn judge(&self, row: &'static str, board: &Board) -> Verdict {
         let value = self.value(row, board);
         let (sign, limit, met) = match self.bound {
             AtMost(limit) => ("at most", limit, value.map(|value| value <= limit)),
             AtLeast(limit) => ("at least", limit, value.map(|value| value >= limit)),
         };
-        let of = match self.of {
+        let of = match self.statistic {
             Median => "",
             P50 => ", p50",
             P99 => ", p99",
@@ -112,12 +112,12 @@ impl Target {
     }
 
     fn value(&self, row: &str, board: &Board) -> Option<f64> {
-        let value = match (self.of, self.over) {
+        let value = match (self.statistic, self.over) {
             (Median, None) => board.find(row, self.figure)?.median,
             (Median, Some(over)) => board.ratio(row, self.figure, over)?,
-            (of, None) => of.pick(&board.find(row, self.figure)?.latency?),
-            (of, Some(over)) => {
-                let of_figure = |name| Some(of.pick(&board.find(row, name)?.latency?));
+            (statistic, None) => statistic.pick(&board.find(row, self.figure)?.latency?),
+            (statistic, Some(over)) => {
+                let of_figure = |name| Some(statistic.pick(&board.find(row, name)?.latency?));
                 of_figure(self.figure)? / of_figure(over)?
             }
         };

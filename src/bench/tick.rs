@@ -1,4 +1,4 @@
-//! How late a tick begins: in a run, bare, and by cyclictest, in turn, at the same priority and period on the same core.
+//! Measures the lateness of a tick in a run, in a bare loop and in cyclictest, in turn, with the same priority, period and core.
 
 use super::board::Board;
 use super::chain::{APART, run_live, stages};
@@ -10,9 +10,9 @@ use crate::telemetry::{Grant, Latency};
 use std::process::{Command, Stdio};
 
 const PERIOD_NS: u64 = 1_000_000;
-/// How long before a tick a role wakes to spin, ns.
+/// The time before a tick at which a role wakes to spin, ns.
 const LEAD_NS: u64 = 60_000;
-/// The longest latency that cyclictest keeps apart, ns: its own limit.
+/// The longest latency in cyclictest's histogram, ns: its own limit.
 const LONGEST_NS: u64 = 1_000_000;
 
 /// Measures the row.
@@ -46,7 +46,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     Ok(())
 }
 
-/// So many bare ticks in the leader's place, each waited for with this lead; and how far their rate was off, %.
+/// Runs bare ticks with the leader's privileges, each with this lead. Returns their lateness, and the error of their rate, %.
 fn bare(bench: &Bench<'_>, board: &mut Board, ticks: u64, lead_ns: u64) -> Result<(Latency, f64), BenchError> {
     bench.in_the_leaders_place(board, |_| {
         let mut latency = Latency::default();
@@ -64,12 +64,12 @@ fn bare(bench: &Bench<'_>, board: &mut Board, ticks: u64, lead_ns: u64) -> Resul
             first_ns = if tick == 0 { last_ns } else { first_ns };
             latency.record(due_ns, last_ns);
         }
-        let should_ns = (ticks - 1) * PERIOD_NS;
-        Ok((latency, ((last_ns - first_ns) as f64 / should_ns as f64 - 1.0).abs() * 100.0))
+        let expected_ns = (ticks - 1) * PERIOD_NS;
+        Ok((latency, ((last_ns - first_ns) as f64 / expected_ns as f64 - 1.0).abs() * 100.0))
     })
 }
 
-/// The same by cyclictest; or why there is none.
+/// Measures the lateness with cyclictest, or returns the reason why it cannot.
 fn cyclictest(bench: &Bench<'_>, board: &mut Board, ticks: u64) -> Result<Result<Latency, String>, BenchError> {
     let grants = bench.in_the_leaders_place(board, |place| Ok(place.grants.clone()))?;
     let granted = |name: &str| grants.iter().find(|grant: &&Grant| grant.granted && grant.privilege == name);
@@ -95,10 +95,10 @@ fn cyclictest(bench: &Bench<'_>, board: &mut Board, ticks: u64) -> Result<Result
     Ok(parse(&String::from_utf8_lossy(&done.stdout)))
 }
 
-/// The histogram in cyclictest's JSON, which begins with the first brace.
+/// Reads the histogram from cyclictest's JSON, which begins with the first brace.
 fn parse(text: &str) -> Result<Latency, String> {
     let json = text.find('{').map_or("", |begin| &text[begin..]);
-    // What it prints after the object is of no concern.
+    // Text after the object is ignored.
     let mut values = serde_json::Deserializer::from_str(json).into_iter::<serde_json::Value>();
     let value = values.next().and_then(Result::ok).ok_or("its JSON cannot be read")?;
     let thread = &value["thread"]["0"];
@@ -110,7 +110,7 @@ fn parse(text: &str) -> Result<Latency, String> {
         (0..count).for_each(|_| latency.record(0, ns));
         counted += count;
     }
-    // What was longer than its histogram counts as its longest.
+    // Latencies beyond the histogram count as the maximum.
     let (cycles, longest) = (thread["cycles"].as_u64().unwrap_or(counted), thread["max"].as_u64().unwrap_or(0));
     (counted..cycles).for_each(|_| latency.record(0, longest));
     Ok(latency)
@@ -121,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cyclictest_is_read_with_what_it_could_not_resolve() {
+    fn latencies_beyond_cyclictests_histogram_count_as_the_maximum() {
         let text = r#"# /dev/cpu_dma_latency set to 0us
 {"thread": {"0": {"histogram": {"1000": 2, "30000": 1}, "cycles": 4, "min": 1000, "max": 2000000}}}
 # Total: 4"#;

@@ -1,8 +1,7 @@
-//! A whole `corotate run` as its user starts it, watched from outside: how long it takes to start and stop, what its
-//! processes take of the system, at which rate its ticks really come.
+//! Observes a whole `corotate run` from outside: the times to start and stop, the resources of its processes, and the true rate
+//! of its ticks.
 //!
-//! Looks at /proc and at the run's own signals, as any program may. Must not disturb what it watches more than a reader of
-//! these signals does.
+//! It reads /proc and the run's signals, as any program may. Must not disturb the run more than a reader of these signals does.
 
 use super::session::{Bench, BenchError};
 use crate::bus::domain::Domain;
@@ -23,13 +22,13 @@ use std::path::PathBuf;
 use std::process::{Child, Stdio};
 use std::time::Duration;
 
-/// Between two looks, ns.
-const LOOK_NS: u64 = 1_000_000;
-/// Looks between two at memory.
-const SLOW_LOOKS: u64 = 20;
+/// The time between two observations, ns.
+const OBSERVE_NS: u64 = 1_000_000;
+/// Observations between two readings of memory.
+const MEMORY_EVERY: u64 = 20;
 /// Words of a stamp.
 const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
-/// A run that takes so much longer than it should hangs, ns.
+/// The excess duration after which a run counts as hung, ns.
 const HUNG_NS: u64 = 60_000_000_000;
 
 /// One process of a run.
@@ -40,7 +39,7 @@ pub(super) struct Process {
     pub pid: i32,
 }
 
-/// What a run showed.
+/// The observations of a run.
 #[derive(Debug, Default)]
 pub(super) struct Observed {
     /// From the start of the process to the first tick, ms.
@@ -49,35 +48,35 @@ pub(super) struct Observed {
     pub stop_ms: Option<f64>,
     /// Peak resident memory by process, and the part of it that is not the program's own file, MiB.
     pub resident_mib: BTreeMap<String, [f64; 2]>,
-    /// The most shared memory at any look, MiB.
+    /// The most shared memory at any observation, MiB.
     pub shared_mib: f64,
-    /// How far the rate of the leader's ticks was from what it should be, %.
+    /// The error of the leader's tick rate, %.
     pub rate_error_percent: Option<f64>,
 }
 
-/// A run to be watched.
+/// The settings of an observed run.
 pub(super) struct Watch<'a> {
-    /// Overrides of the scenario that is measured.
+    /// Overrides of the measured scenario.
     pub overrides: &'a [&'a str],
-    /// Environment of all its processes.
+    /// Environment variables of all its processes.
     pub environment: Vec<(&'static str, OsString)>,
     /// Called once, a sixth of the run after the first tick, with its processes and its period, ns.
     pub midway: &'a mut dyn FnMut(&[Process], u64),
 }
 
-/// The run's own signals.
-struct Line {
+/// The signals of the run.
+struct Signals {
     domain: Domain,
     schedule: IoxReader<Schedule>,
     leader: WordReader,
-    /// Tick and time of the first and last measurement seen.
+    /// Tick and time of the first and the last received measurement.
     seen: Option<[(u64, u64); 2]>,
-    /// Last, so that it is dropped after what was opened on it.
+    /// The last field, so that it is dropped after the readers opened on it.
     _bus: IoxBus,
 }
 
 impl Watch<'_> {
-    /// Runs it to its end.
+    /// Runs the scenario to its end and returns the observations.
     pub fn run(&mut self, bench: &mut Bench<'_>) -> Result<Observed, BenchError> {
         let scenario = bench.scenario(self.overrides)?;
         let directory = tempfile::tempdir().map_err(BenchError::system("make a temporary directory"))?;
@@ -91,7 +90,7 @@ impl Watch<'_> {
         let mut child = command.spawn().map_err(BenchError::system("start a run"))?;
         let observed = self.follow(bench, &scenario, &mut child, started_ns);
         if observed.is_err() {
-            // It ends in order, its roles with it.
+            // The launcher ends its roles, then itself.
             let _ = Pid::from_raw(child.id() as i32).map(|pid| kill_process(pid, Kill::TERM));
             let _ = child.wait();
         }
@@ -106,16 +105,17 @@ impl Watch<'_> {
         started_ns: u64,
     ) -> Result<Observed, BenchError> {
         let length_ns = scenario.last_tick * scenario.period_ns;
-        let (mut observed, mut line, mut epoch_ns, mut look) = (Observed::default(), None, None, 0_u64);
+        let (mut observed, mut signals, mut epoch_ns, mut observations) = (Observed::default(), None, None, 0_u64);
         let mut processes = vec![Process { name: "launcher".to_owned(), pid: child.id() as i32 }];
         let mut midway_done = false;
         loop {
-            std::thread::sleep(Duration::from_nanos(LOOK_NS));
-            look += 1;
+            std::thread::sleep(Duration::from_nanos(OBSERVE_NS));
+            observations += 1;
             if let Some(status) = child.try_wait().map_err(BenchError::system("wait for a run"))? {
                 let last_tick_ns = epoch_ns.map(|epoch_ns: u64| epoch_ns + length_ns);
                 observed.stop_ms = last_tick_ns.map(|last_ns| monotonic_ns().saturating_sub(last_ns) as f64 / 1e6);
-                observed.rate_error_percent = line.as_ref().and_then(|line: &Line| line.rate_error(scenario));
+                observed.rate_error_percent =
+                    signals.as_ref().and_then(|signals: &Signals| signals.rate_error(scenario));
                 return match status.success() {
                     true => Ok(observed),
                     false => Err(BenchError::Peer(format!("a whole run ended with {status}"))),
@@ -125,17 +125,17 @@ impl Watch<'_> {
             if monotonic_ns() > started_ns + length_ns + HUNG_NS {
                 return Err(BenchError::Peer("a whole run hangs".to_owned()));
             }
-            match &mut line {
+            match &mut signals {
                 None => {
                     let children = children_of(child.id() as i32);
-                    line = Line::open(scenario, &children);
+                    signals = Signals::open(scenario, &children);
                 }
-                Some(line) => {
+                Some(signals) => {
                     if epoch_ns.is_none() {
-                        epoch_ns = line.epoch_ns()?;
+                        epoch_ns = signals.epoch_ns()?;
                         observed.start_ms = epoch_ns.map(|epoch| epoch.saturating_sub(started_ns) as f64 / 1e6);
                     }
-                    line.look_at_leader()?;
+                    signals.read_leader()?;
                 }
             }
             let due = epoch_ns.is_some_and(|epoch_ns| monotonic_ns() > epoch_ns + length_ns / 6);
@@ -144,17 +144,17 @@ impl Watch<'_> {
                 processes.extend(roles(scenario, child.id() as i32));
                 (self.midway)(&processes, scenario.period_ns);
             }
-            if look % SLOW_LOOKS == 0 || due {
-                observed.look_at_memory(&processes, line.as_ref().map(|line| &line.domain));
+            if observations % MEMORY_EVERY == 0 || due {
+                observed.read_memory(&processes, signals.as_ref().map(|signals| &signals.domain));
             }
         }
     }
 }
 
 impl Observed {
-    fn look_at_memory(&mut self, processes: &[Process], domain: Option<&Domain>) {
+    fn read_memory(&mut self, processes: &[Process], domain: Option<&Domain>) {
         for process in processes {
-            // The peak never falls; a process that is ending has none.
+            // The peak never falls; a process that is ending has no value.
             let words = ["VmHWM:", "RssAnon:", "RssShmem:"].map(|word| status_word(process.pid, word));
             if let [Some(peak), Some(anonymous), Some(shared)] = words {
                 let mib = self.resident_mib.entry(process.name.clone()).or_default();
@@ -168,8 +168,8 @@ impl Observed {
     }
 }
 
-impl Line {
-    /// Opens the signals of the run whose roles are among these processes; none while it has none.
+impl Signals {
+    /// Opens the signals of the run whose roles are among these processes; `None` while there are no roles.
     fn open(scenario: &Scenario, processes: &[(i32, Vec<String>)]) -> Option<Self> {
         let root = processes.iter().find_map(|(_, words)| argument(words, "--domain").map(PathBuf::from))?;
         let domain = Domain::join(&root).ok()?;
@@ -181,14 +181,14 @@ impl Line {
         Some(Self { domain, schedule, leader, seen: None, _bus: bus })
     }
 
-    /// When the first tick is due, once that is known.
+    /// Returns the time at which the first tick is due, once it is known.
     fn epoch_ns(&mut self) -> Result<Option<u64>, BenchError> {
         while self.schedule.advance()? {}
         let runs = self.schedule.current().filter(|word| Phase::from_number(word.phase) == Phase::Run);
         Ok(runs.map(|word| word.epoch_ns).filter(|epoch_ns| *epoch_ns > 0))
     }
 
-    fn look_at_leader(&mut self) -> Result<(), BenchError> {
+    fn read_leader(&mut self) -> Result<(), BenchError> {
         while let Some(words) = self.leader.next()? {
             let stamp: Stamp = bytemuck::pod_read_unaligned(bytemuck::cast_slice(&words[..STAMP]));
             // Generation 0 is warm-up.
@@ -200,15 +200,15 @@ impl Line {
         Ok(())
     }
 
-    /// How far the rate of ticks was from the scenario's, %.
+    /// Returns the error of the tick rate relative to the scenario's, %.
     fn rate_error(&self, scenario: &Scenario) -> Option<f64> {
         let [(first, from_ns), (last, to_ns)] = self.seen?;
-        let should_ns = (last - first) * scenario.period_ns;
-        (should_ns > 0).then(|| ((to_ns - from_ns) as f64 / should_ns as f64 - 1.0).abs() * 100.0)
+        let expected_ns = (last - first) * scenario.period_ns;
+        (expected_ns > 0).then(|| ((to_ns - from_ns) as f64 / expected_ns as f64 - 1.0).abs() * 100.0)
     }
 }
 
-/// The processes that a process has started, with their command lines.
+/// Returns the child processes of a process, with their command lines.
 fn children_of(parent: i32) -> Vec<(i32, Vec<String>)> {
     let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
     let pids = entries.filter_map(|entry| entry.file_name().to_str()?.parse::<i32>().ok());
@@ -225,7 +225,7 @@ fn argument<'a>(words: &'a [String], name: &str) -> Option<&'a str> {
     words.get(index + 1).map(String::as_str)
 }
 
-/// The roles that a launcher has started.
+/// Returns the roles that a launcher has started.
 fn roles(scenario: &Scenario, launcher: i32) -> Vec<Process> {
     let names = scenario.rig.roles();
     let role = |(pid, words): (i32, Vec<String>)| {
@@ -236,13 +236,13 @@ fn roles(scenario: &Scenario, launcher: i32) -> Vec<Process> {
     children_of(launcher).into_iter().filter_map(role).collect()
 }
 
-/// A number of /proc/PID/status.
+/// Returns a number of /proc/PID/status.
 pub(super) fn status_word(pid: i32, key: &str) -> Option<u64> {
     let text = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
     text.lines().find_map(|line| line.strip_prefix(key)?.split_whitespace().next()?.parse().ok())
 }
 
-/// What a domain's files take of shared memory, bytes.
+/// Returns the shared memory of a domain's files, bytes.
 fn shared_bytes(domain: &Domain) -> u64 {
     let own = domain
         .shared_memory_files()
