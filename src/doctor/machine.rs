@@ -1,6 +1,6 @@
-//! What a machine tells of itself in files, held against what a run asks of it.
+//! Reads a machine's settings from files, and compares them with the demands of a run.
 //!
-//! All files lie below a root, so that a test can be a machine. Must not write, but for opening what must be writable.
+//! All files lie below a root, so that a test can simulate a machine. Must not write; it only opens files that must be writable.
 
 use super::Check;
 use crate::config::Realtime;
@@ -17,24 +17,24 @@ const CAP_SYS_NICE: u64 = 1 << 23;
 /// Lines of /proc/self/limits.
 const PRIORITY_LIMIT: &str = "Max realtime priority";
 const LOCKED_LIMIT: &str = "Max locked memory";
-/// What keeps idle cores from sleeping deeply while it is held open.
+/// The device that keeps idle cores out of deep sleep states while it is open.
 const IDLE_DEVICE: &str = "dev/cpu_dma_latency";
 /// A limit on locked memory below this is not safe: see `runtime/privileges.rs`.
 const ENOUGH_LOCKED: u64 = 256 << 20;
-/// The part of a period that real-time tasks may use, at the least.
+/// The least acceptable share of a period for real-time tasks.
 const RT_SHARE_MIN: f64 = 0.9;
-/// Clock sources that are read without leaving the process, or nearly so.
+/// Clock sources that are read without a system call, or nearly so.
 const FAST_CLOCKS: [&str; 5] =
     ["tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "riscv_clocksource"];
-/// Clock sources that cost a slow bus cycle each time.
+/// Clock sources that need a slow bus cycle per read.
 const SLOW_CLOCKS: [&str; 4] = ["hpet", "acpi_pm", "pit", "jiffies"];
 
-/// What a run asks of the machine.
+/// The demands of a run on the machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Demand {
-    /// Processes that take part in a tick.
+    /// Number of processes that take part in a tick.
     pub roles: usize,
-    /// Cores that this process may use.
+    /// Number of cores that this process may use.
     pub cores: usize,
     /// The SCHED_FIFO priority; 0 for none.
     pub priority: i32,
@@ -43,7 +43,7 @@ pub struct Demand {
 }
 
 impl Demand {
-    /// What a scenario asks, of the cores that this process may use.
+    /// Returns the demands of a scenario.
     pub fn of(scenario: &Scenario) -> Self {
         Self {
             roles: RoleId::all(scenario).len(),
@@ -54,19 +54,19 @@ impl Demand {
     }
 }
 
-/// A machine, seen through its files.
+/// A machine, represented by its files.
 #[derive(Debug, Clone)]
 pub struct Machine {
     root: PathBuf,
 }
 
 impl Machine {
-    /// The machine whose files lie below `root`: `/` is this one.
+    /// Returns the machine whose files lie below `root`; `/` is this machine.
     pub fn at(root: &Path) -> Self {
         Self { root: root.to_owned() }
     }
 
-    /// Everything that files tell.
+    /// Runs all checks of files.
     pub fn examine(&self, demand: &Demand) -> Vec<Check> {
         vec![
             self.preemption(),
@@ -84,8 +84,8 @@ impl Machine {
         ]
     }
 
-    /// What a run in real time asks for and will not be granted, in words, and the one command that grants it to the shell in
-    /// which it is typed; none if nothing is known to be lacking.
+    /// Returns the requests of a real-time run that will be refused, in words, and one command that grants them to the shell in
+    /// which it is typed; `None` if no request is known to be refused.
     pub fn ungranted(&self, asked: &Realtime) -> Option<(String, String)> {
         let below = |capability, title, needed: u64| {
             !self.capable(capability) && matches!(self.limit(title), Some(Some(limit)) if limit < needed)
@@ -100,7 +100,7 @@ impl Machine {
             limits += " --memlock=unlimited";
         }
         if !limits.is_empty() {
-            // The limits of the shell are those of what it starts.
+            // Child processes inherit the limits of the shell.
             commands.push(format!("prlimit --pid $${limits}"));
         }
         let idle = OpenOptions::new().write(true).open(self.root.join(IDLE_DEVICE));
@@ -116,7 +116,7 @@ impl Machine {
         Some((lacking.join(", "), command))
     }
 
-    /// A file's text without blanks around it; none if it is empty, missing or closed to us.
+    /// Returns a file's text without surrounding blanks; `None` if it is empty, missing or unreadable.
     fn read(&self, path: &str) -> Option<String> {
         let bytes = std::fs::read(self.root.join(path)).ok()?;
         Some(String::from_utf8_lossy(&bytes).trim().to_owned()).filter(|text| !text.is_empty())
@@ -125,7 +125,7 @@ impl Machine {
     fn preemption(&self) -> Check {
         let name = "kernel preemption";
         let version = self.read("proc/version").unwrap_or_default();
-        // The file tells which of its modes a dynamic kernel is in: "none voluntary (full) lazy".
+        // The file marks the current mode of a dynamic kernel: "none voluntary (full) lazy".
         let modes = self.read("sys/kernel/debug/sched/preempt");
         let mode = modes.as_deref().and_then(|modes| Some(modes.split_once('(')?.1.split_once(')')?.0.to_owned()));
         let kernel = |word: &str| version.split_whitespace().any(|part| part == word);
@@ -157,14 +157,14 @@ impl Machine {
         Check::ok(name, "no")
     }
 
-    /// A line of /proc/self/limits: the limit that holds; `None` inside for none.
+    /// Returns the soft limit in a line of /proc/self/limits; the inner `None` means unlimited.
     fn limit(&self, title: &str) -> Option<Option<u64>> {
         let limits = self.read("proc/self/limits")?;
         let soft = limits.lines().find_map(|line| line.strip_prefix(title))?.split_whitespace().next()?;
         if soft == "unlimited" { Some(None) } else { soft.parse().ok().map(Some) }
     }
 
-    /// Whether this process has an effective capability; false if that is not told.
+    /// Returns true if this process is known to have an effective capability.
     fn capable(&self, capability: u64) -> bool {
         let status = self.read("proc/self/status").unwrap_or_default();
         let effective = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
@@ -211,7 +211,7 @@ impl Machine {
             (Some(runtime), Some(period)) if period > 0 => {
                 let found = format!("{runtime} of {period} us for real-time tasks");
                 let share = runtime as f64 / period as f64;
-                // What the roles spin is bounded, so the usual 5 % for others are theirs anyway.
+                // Roles spin for a bounded time, so they leave the usual 5 % to other tasks anyway.
                 if share >= RT_SHARE_MIN { Check::ok(name, found) } else { Check::bad(name, found, remedy) }
             }
             _ => Check::warn(name, "unknown", remedy),
@@ -221,7 +221,7 @@ impl Machine {
     fn idle(&self) -> Check {
         let name = "cpu_dma_latency";
         let remedy = "allow this user to write /dev/cpu_dma_latency: else cores sleep deeply and wake late";
-        // Nothing is asked for until something is written.
+        // Opening alone requests nothing; only a write does.
         match OpenOptions::new().write(true).open(self.root.join(IDLE_DEVICE)) {
             Ok(_) => Check::ok(name, "writable"),
             Err(error) => Check::warn(name, format!("not writable: {error}"), remedy),
@@ -231,7 +231,7 @@ impl Machine {
     fn governor(&self) -> Check {
         let name = "cpufreq governor";
         let governor = |core: usize| self.read(&format!("sys/devices/system/cpu/cpu{core}/cpufreq/scaling_governor"));
-        // Cores may be missing in between; there are no more than this.
+        // Core numbers may have gaps; none is above this.
         let mut governors: Vec<String> = (0..1024).filter_map(governor).collect();
         governors.sort();
         governors.dedup();
@@ -293,7 +293,7 @@ impl Machine {
         let remedy = "free some, or `mount -o remount,size=2g /dev/shm`";
         match free {
             free if free < needed => Check::bad(name, found, remedy),
-            // A second run, or a recorder's cache, and it is full.
+            // A second run or a recorder's cache would fill it.
             free if free < needed.saturating_mul(2) => Check::warn(name, found, remedy),
             _ => Check::ok(name, found),
         }
@@ -313,7 +313,7 @@ mod tests {
 
     const DEMAND: Demand = Demand { roles: 4, cores: 4, priority: 80, shared_memory: 1 };
 
-    /// A machine made of these files.
+    /// Creates a machine of these files.
     fn machine(files: &[(&str, &str)]) -> (tempfile::TempDir, Machine) {
         let root = tempfile::tempdir().unwrap();
         for (path, text) in files {
@@ -334,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_known_of_an_empty_machine_and_nothing_panics() {
+    fn an_empty_machine_is_unknown_without_a_panic() {
         let (_root, machine) = machine(&[]);
         for check in machine.examine(&DEMAND) {
             assert!(check.remedy.is_some() || check.verdict == Verdict::Ok, "{check:?}");
@@ -348,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_granted_is_told_with_one_command() {
+    fn refused_requests_are_granted_with_one_command() {
         let ungranted = |priority: &str, locked: &str, capabilities: &str| {
             let status = format!("CapEff:\t{capabilities}\n");
             let (_root, machine) =
@@ -368,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn rubbish_is_unknown() {
+    fn invalid_values_are_unknown() {
         let (_root, machine) = machine(&[
             ("proc/version", "\u{1}\u{2}"),
             ("proc/self/limits", "Max locked memory   much\nMax realtime priority\n"),
@@ -387,20 +387,20 @@ mod tests {
     }
 
     #[test]
-    fn preemption_is_that_of_the_kernel_s_mode() {
-        let of = |version: &str, modes: &str| {
+    fn preemption_follows_the_mode_of_the_kernel() {
+        let verdict = |version: &str, modes: &str| {
             let (_root, machine) = machine(&[("proc/version", version), ("sys/kernel/debug/sched/preempt", modes)]);
             machine.preemption().verdict
         };
-        assert_eq!(of("Linux 6.12 #1 SMP PREEMPT_RT", ""), Verdict::Ok);
-        assert_eq!(of("Linux 6.12 #1 SMP PREEMPT_DYNAMIC", "none voluntary (full) lazy"), Verdict::Warn);
-        assert_eq!(of("Linux 6.12 #1 SMP PREEMPT_DYNAMIC", "none (voluntary) full"), Verdict::Bad);
-        assert_eq!(of("Linux 6.12 #1 SMP PREEMPT_DYNAMIC", ""), Verdict::Warn);
-        assert_eq!(of("Linux 6.12 #1 SMP", ""), Verdict::Bad);
+        assert_eq!(verdict("Linux 6.12 #1 SMP PREEMPT_RT", ""), Verdict::Ok);
+        assert_eq!(verdict("Linux 6.12 #1 SMP PREEMPT_DYNAMIC", "none voluntary (full) lazy"), Verdict::Warn);
+        assert_eq!(verdict("Linux 6.12 #1 SMP PREEMPT_DYNAMIC", "none (voluntary) full"), Verdict::Bad);
+        assert_eq!(verdict("Linux 6.12 #1 SMP PREEMPT_DYNAMIC", ""), Verdict::Warn);
+        assert_eq!(verdict("Linux 6.12 #1 SMP", ""), Verdict::Bad);
     }
 
     #[test]
-    fn limits_are_held_against_what_is_asked_and_capabilities_lift_them() {
+    fn limits_must_cover_the_requests_unless_capabilities_do() {
         let (_root, poor) =
             machine(&[("proc/self/limits", &limits("0", "8388608")), ("proc/self/status", "CapEff:\t0\n")]);
         assert_eq!((poor.priority(80).verdict, poor.locked_memory().verdict), (Verdict::Bad, Verdict::Warn));
@@ -437,7 +437,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_short_is_told() {
+    fn every_shortage_has_its_verdict() {
         let (_root, machine) = machine(&[
             ("proc/cpuinfo", "flags\t\t: fpu hypervisor tsc\n"),
             ("proc/sys/kernel/sched_rt_runtime_us", "500000\n"),

@@ -1,11 +1,11 @@
-//! Is this machine fit for real time? What the kernel and its limits say, and how many ticks of the scenario it misses.
+//! Checks whether this machine is fit for real time: kernel settings and limits, and the ticks of the scenario that it misses.
 //!
 //! | file | duty |
 //! |---|---|
-//! | `machine` | reads /proc, /sys and /dev below a root, and judges each line |
-//! | `trial` | judges what the roles of the scenario reported of some seconds in real time |
+//! | `machine` | reads /proc, /sys and /dev below a root, and judges each value |
+//! | `trial` | judges the roles' reports of a few seconds in real time |
 //!
-//! Must not change the machine, nor start the run, and must not fail: what the system does not tell is said to be unknown.
+//! Must not change the machine, nor start the run, and must not fail: a value that the system does not provide is unknown.
 
 mod machine;
 mod trial;
@@ -22,23 +22,23 @@ use std::path::Path;
 
 /// Layout version of the report.
 const SCHEMA: &str = "corotate/doctor/v1";
-/// How wide the column of names is.
+/// The width of the column of names.
 const NAME_WIDTH: usize = 20;
 
-/// What a line of the report comes to.
+/// The verdict of one line of the report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Verdict {
-    /// As it should be.
+    /// No change is needed.
     Ok,
-    /// It works, and something is to be gained, or is not known.
+    /// It works, but can be improved or is unknown.
     Warn,
-    /// Deadlines will be missed for it.
+    /// It causes missed deadlines.
     Bad,
 }
 
 impl Verdict {
-    /// Its word.
+    /// Returns the word in the report.
     pub fn name(self) -> &'static str {
         match self {
             Self::Ok => "ok",
@@ -51,13 +51,13 @@ impl Verdict {
 /// One line of the report.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Check {
-    /// What was looked at.
+    /// The name of the checked item.
     pub name: &'static str,
-    /// What was found.
+    /// The value that was found.
     pub found: String,
-    /// What it comes to.
+    /// The verdict on it.
     pub verdict: Verdict,
-    /// What to do about it; none where all is well.
+    /// The remedy; `None` if the verdict is ok.
     pub remedy: Option<String>,
 }
 
@@ -80,9 +80,9 @@ impl Check {
 pub struct Diagnosis {
     schema: &'static str,
     host: MachineInfo,
-    /// The scenario whose demands the machine is held to.
+    /// The scenario whose demands the machine must meet.
     pub scenario: String,
-    /// True if the scenario was run and no line is bad; none if no line is bad and it was not run.
+    /// True if the scenario was run and no line is bad; `None` if no line is bad and it was not run.
     pub fit: Option<bool>,
     /// The lines.
     pub checks: Vec<Check>,
@@ -91,7 +91,7 @@ pub struct Diagnosis {
 }
 
 impl Diagnosis {
-    /// Puts a report together.
+    /// Creates a report.
     pub fn new(scenario: &str, mut checks: Vec<Check>, trial: Option<Trial>) -> Self {
         checks.extend(trial.iter().map(Trial::check));
         let bad = checks.iter().any(|check| check.verdict == Verdict::Bad);
@@ -99,13 +99,13 @@ impl Diagnosis {
         Self { schema: SCHEMA, host: MachineInfo::local(), scenario: scenario.to_owned(), fit, checks, trial }
     }
 
-    /// The report as one line of JSON.
+    /// Returns the report as one line of JSON.
     pub fn to_json(&self) -> String {
         serde_json::to_string(self).expect("a report of plain values is JSON") + "\n"
     }
 }
 
-/// For people: one line per check, and what to do below it.
+/// Writes one line per check, with its remedy below it.
 impl fmt::Display for Diagnosis {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{}, {}", self.host.cpu, self.host.kernel)?;
@@ -129,7 +129,7 @@ impl fmt::Display for Diagnosis {
     }
 }
 
-/// What is left of runs whose launcher was killed. Where others can write, nobody knows whose it is.
+/// Returns the line on domains whose launcher was killed, or on a run directory in which other users can write.
 pub fn leftovers(domains: Result<Vec<FoundDomain>, DomainError>) -> Check {
     let name = "leftover domains";
     let domains = match domains {
@@ -152,7 +152,7 @@ pub fn leftovers(domains: Result<Vec<FoundDomain>, DomainError>) -> Check {
     }
 }
 
-/// Returns the line on leftovers of dead runs in shared memory; none if there are none.
+/// Returns the line on leftovers of dead runs in shared memory; `None` without leftovers.
 pub fn left_in_shared_memory(left: AbandonedFiles) -> Option<Check> {
     let AbandonedFiles { runs, files, bytes } = left;
     let found = format!(
@@ -163,7 +163,7 @@ pub fn left_in_shared_memory(left: AbandonedFiles) -> Option<Check> {
     (runs > 0).then(|| Check::warn("leftover memory", found, remedy))
 }
 
-/// Returns the line on a real-time priority that the limits allow and the kernel refuses; none if it is granted.
+/// Returns the line on a real-time priority that the limits allow and the kernel refuses; `None` if it is granted.
 pub fn refused(priority: i32) -> Option<Check> {
     let error = (priority > 0).then(|| refused_priority(priority)).flatten()?;
     Some(Check::bad("SCHED_FIFO", format!("{priority} is refused: {error}"), priority_remedy(Path::new("/"))))
@@ -174,7 +174,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_bad_line_is_enough_and_every_other_line_says_what_to_do() {
+    fn one_bad_line_makes_the_machine_unfit_and_remedies_are_listed() {
         let warned = vec![Check::ok("a", "1"), Check::warn("b", "2", "mend b")];
         let unmeasured = Diagnosis::new("test", warned.clone(), None);
         assert!(unmeasured.fit.is_none(), "what did not run is not fit");
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn the_dead_are_told_and_the_living_are_not_blamed() {
+    fn leftovers_of_dead_runs_are_a_warning_and_live_runs_are_not() {
         let found = |alive| FoundDomain { root: "/run/corotate/00000000".into(), alive, made: None };
         assert_eq!(leftovers(Ok(vec![found(true)])).verdict, Verdict::Ok);
         let check = leftovers(Ok(vec![found(true), found(false)]));

@@ -1,13 +1,13 @@
-//! The trial run: the scenario itself, in real time for some seconds, and the ticks that were missed.
+//! The trial run: a few seconds of the scenario in real time, and the ticks that were missed.
 //!
-//! Must not start the run; and must not judge anything but what ran.
+//! Must not start the run, and must judge only what ran.
 
 use super::Check;
 use crate::telemetry::{Grant, Latency, Percentiles, RoleReport, Ticks};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
-/// From this share of its ticks on, a role that missed or starved makes the machine unfit.
+/// The share of a role's ticks, missed or starved, from which the machine is unfit.
 const SHARE_MAX: f64 = 1e-3;
 
 /// The reports of the roles.
@@ -17,27 +17,28 @@ pub struct Trial {
     pub tick_hz: f64,
     /// The ticks of each role.
     pub ticks: u64,
-    /// The role with the most ticks missed or starved.
+    /// The role with the most missed or starved ticks.
     pub worst_role: String,
     /// The number of these ticks.
     pub missed: u64,
     /// Their share of its ticks.
     pub missed_share: f64,
-    /// All that the roles counted.
+    /// The tick counts of all roles.
     pub roles: BTreeMap<String, Ticks>,
-    /// Wake − due of all bodies.
+    /// The lateness of all bodies: wake time − due time.
     pub lateness: Percentiles,
-    /// The privileges that were asked for, and whether the machine granted them.
+    /// The requested privileges, granted or not.
     pub grants: Vec<Grant>,
 }
 
 impl Trial {
-    /// Draws up what the roles of a run of so many ticks reported.
+    /// Creates the result from the roles' reports of a run of `ticks` ticks.
     pub fn new(tick_hz: f64, ticks: u64, reports: &[RoleReport], launcher: &[Grant]) -> Self {
-        // A tick that a role did not come to is as good as missed.
+        // A tick that a role did not reach counts as missed.
         let missed = |role: &Ticks| role.missed + role.starved + ticks.saturating_sub(role.elapsed);
         let worst = reports.iter().rev().max_by_key(|report| missed(&report.ticks));
-        let (worst_role, missed) = worst.map_or_else(Default::default, |of| (of.role.clone(), missed(&of.ticks)));
+        let (worst_role, missed) =
+            worst.map_or_else(Default::default, |report| (report.role.clone(), missed(&report.ticks)));
         let mut lateness = Latency::default();
         let stages = reports.iter().flat_map(|report| &report.stages);
         stages.filter(|stage| stage.stage == "lateness").for_each(|stage| lateness.absorb(&stage.latency()));
@@ -67,7 +68,7 @@ impl Trial {
         format!("{missed} of {ticks} ticks{share} would be missed in {seconds} s at {tick_hz} Hz")
     }
 
-    /// The line of the report.
+    /// Returns the line of the report.
     pub fn check(&self) -> Check {
         let mut denied: Vec<&str> = self.grants.iter().filter(|g| !g.granted).map(|g| g.privilege.as_str()).collect();
         denied.sort_unstable();
@@ -94,7 +95,7 @@ impl Trial {
         }
     }
 
-    /// The line of a run that failed.
+    /// Returns the line for a run that failed.
     pub fn failed(reason: String) -> Check {
         Check::bad(NAME, reason, "`corotate run` says more of it")
     }
@@ -130,19 +131,19 @@ mod tests {
     }
 
     #[test]
-    fn the_verdict_is_by_the_ticks_that_were_missed() {
-        let of = |missed, starved, safe, elapsed| {
+    fn the_verdict_follows_from_the_missed_ticks() {
+        let trial = |missed, starved, safe, elapsed| {
             let whole = Ticks { elapsed: 10_000, executed: 10_000, ..Ticks::default() };
             let ticks = Ticks { elapsed, executed: elapsed - missed, missed, starved, safe, ..Ticks::default() };
             Trial::new(1000.0, 10_000, &[role("leader", whole), role("follower", ticks)], &[])
         };
         let verdict = |trial: Trial| (trial.check().verdict, trial.missed);
-        assert_eq!(verdict(of(0, 0, 0, 10_000)), (Verdict::Ok, 0));
-        assert_eq!(verdict(of(4, 5, 0, 10_000)), (Verdict::Warn, 9));
-        assert_eq!(verdict(of(5, 5, 0, 10_000)), (Verdict::Bad, 10));
-        assert_eq!(verdict(of(0, 0, 1, 10_000)), (Verdict::Bad, 0));
-        assert_eq!(verdict(of(0, 0, 0, 5_000)), (Verdict::Bad, 5_000));
-        let check = of(400, 20, 0, 10_000).check();
+        assert_eq!(verdict(trial(0, 0, 0, 10_000)), (Verdict::Ok, 0));
+        assert_eq!(verdict(trial(4, 5, 0, 10_000)), (Verdict::Warn, 9));
+        assert_eq!(verdict(trial(5, 5, 0, 10_000)), (Verdict::Bad, 10));
+        assert_eq!(verdict(trial(0, 0, 1, 10_000)), (Verdict::Bad, 0));
+        assert_eq!(verdict(trial(0, 0, 0, 5_000)), (Verdict::Bad, 5_000));
+        let check = trial(400, 20, 0, 10_000).check();
         assert!(
             check.found.contains("420 of 10000 ticks (4.20 %)") && check.found.contains("at follower"),
             "{check:?}"
