@@ -1,4 +1,4 @@
-//! corotate: bodies move together although not everything about them can be measured.
+//! corotate: a feedback control loop as separate processes, measured, tested and replayed.
 //!
 //! This file is the map of the crate and holds no logic. The mathematics and the roles are the crate `corotate-core`, the loop is
 //! `corotate-runtime`; their modules stand here under the same names. Arrows between modules point down only:

@@ -169,7 +169,7 @@ pub fn janitor(
     std::thread::Builder::new().spawn(move || sweep(&swept, limit))?;
     let mut nodes = Watched::new(domain.root().join("nodes"));
     loop {
-        // What cannot be removed now is removed when the next process joins.
+        // Files that cannot be removed now are removed when the next process joins.
         let clear = || drop(iox::clear_dead(domain));
         if nodes.changed() {
             clear();

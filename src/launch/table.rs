@@ -18,8 +18,8 @@ const NO_FAULT: &str = "; no fault";
 /// Incidents that are shown unless all are asked for.
 const INCIDENTS: usize = 4;
 
-/// Returns the summary as text: results, latencies of estimate and control, counters, on a screen of 24 lines of 80 columns unless
-/// there are incidents or notes. `all` adds every stage, link, watchdog and privilege, up to 100 columns wide.
+/// Returns the summary as text: results, latencies of estimate and control, counters, and what went wrong. An undisturbed run on one
+/// host fits on a screen of 24 lines of 80 columns. `all` adds every stage, link, watchdog and privilege, up to 100 columns wide.
 pub fn table(summary: &Summary, all: bool) -> String {
     let mut text = String::new();
     let seconds = summary.last_tick as f64 / summary.tick_hz;
@@ -49,7 +49,9 @@ pub fn table(summary: &Summary, all: bool) -> String {
         let _ = writeln!(text, "{} more incidents: -v shows them", summary.incidents.len() - shown);
     }
     if !summary.latencies.is_empty() {
-        let _ = writeln!(text, "\n{}", if all { latencies(summary) } else { critical_latencies(summary) });
+        let critical = Some(critical_latencies(summary)).filter(|rows| !all && !rows.is_empty());
+        let rows = critical.unwrap_or_else(|| latencies(summary));
+        let _ = writeln!(text, "\n{rows}{}", stamps_ahead(summary));
     }
     counters(summary, all, &mut text);
     watchdog(summary, all, &mut text);
@@ -57,9 +59,7 @@ pub fn table(summary: &Summary, all: bool) -> String {
     for line in lines.filter(|line| all || !line.ends_with(NO_FAULT)) {
         let _ = writeln!(text, "{line}");
     }
-    if all {
-        summary.hosts.iter().for_each(|summary| hosts(summary, &mut text));
-    }
+    summary.hosts.iter().for_each(|summary| hosts(summary, &mut text));
     privileges(summary, all, &mut text);
     text.lines().flat_map(|line| [line.trim_end(), "\n"]).collect()
 }
@@ -122,8 +122,7 @@ fn results(summary: &Summary, all: bool, text: &mut String) {
     let hidden = if all { 0 } else { rows.len().saturating_sub(RESULT_ROWS) };
     if hidden > 0 {
         // Failures first, then what is not judged.
-        rows.sort_by_key(|(holds, _)| *holds == Some(true));
-        rows.sort_by_key(|(holds, _)| *holds != Some(false));
+        rows.sort_by_key(|(holds, _)| holds.map_or(1, |holds| if holds { 2 } else { 0 }));
     }
     let mut table = plain(&["result", "at the end", "settled max", "limit", "since", "verdict"]);
     rows.iter().take(rows.len() - hidden).for_each(|(_, row)| _ = table.add_row(row));
@@ -184,11 +183,11 @@ fn verdict(holds: Option<bool>) -> String {
     .to_owned()
 }
 
-/// The latencies of estimate and control, and the latest role at its tick, as a table.
-fn critical_latencies(summary: &Summary) -> String {
+/// The latencies of estimate and control, and the role with the largest p99 of its lateness, as a table.
+fn critical_latencies(summary: &Summary) -> Table {
     let find = |role: &str, stage: &str| summary.latencies.iter().find(|row| row.role == role && row.stage == stage);
     let lateness = summary.latencies.iter().filter(|row| row.stage == "lateness");
-    let latest = lateness.max_by(|one, other| one.figures.p99_us.total_cmp(&other.figures.p99_us));
+    let latest = lateness.max_by(|a, b| a.figures.p99_us.max(0.0).total_cmp(&b.figures.p99_us.max(0.0)));
     let stages =
         [("observer", "step"), ("controller", "step"), ("controller", "age")].map(|(role, stage)| find(role, stage));
     let mut rows = plain(&["latency, us", "p50", "p99", "p99.9", "max"]);
@@ -196,25 +195,31 @@ fn critical_latencies(summary: &Summary) -> String {
         let figures = [row.figures.p50_us, row.figures.p99_us, row.figures.p999_us, row.figures.max_us];
         rows.add_row([format!("{} {}", row.role, row.stage)].into_iter().chain(figures.map(us)));
     }
-    rows.to_string()
+    rows
 }
 
-fn latencies(summary: &Summary) -> String {
+fn latencies(summary: &Summary) -> Table {
     let mut rows = plain(&["latency, us", "stage", "count", "missed", "p50", "p90", "p99", "p99.9", "max"]);
-    // One line per sender, not per stage.
-    let mut ahead = BTreeMap::<&str, (f64, Vec<String>)>::new();
     for stage in &summary.latencies {
         let f = &stage.figures;
         let mut row = vec![stage.role.clone(), stage.stage.clone(), f.count.to_string(), f.missed.to_string()];
         row.extend([f.p50_us, f.p90_us, f.p99_us, f.p999_us, f.max_us].map(us));
         rows.add_row(row);
+    }
+    rows
+}
+
+/// The reason why stages have no figures: a line per sender whose stamps lie ahead of this clock.
+fn stamps_ahead(summary: &Summary) -> String {
+    let mut ahead = BTreeMap::<&str, (f64, Vec<String>)>::new();
+    for stage in &summary.latencies {
         if let Some(sender) = &stage.stamps_of {
             let (most_us, stages) = ahead.entry(sender).or_default();
-            *most_us = most_us.max(f.ahead_max_us);
-            stages.push(format!("{} of {} at {}", stage.stage, stage.role, f.ahead));
+            *most_us = most_us.max(stage.figures.ahead_max_us);
+            stages.push(format!("{} of {} at {}", stage.stage, stage.role, stage.figures.ahead));
         }
     }
-    let mut text = rows.to_string();
+    let mut text = String::new();
     for (sender, (most_us, stages)) in ahead {
         let (most, stages) = (digits(most_us / 1e3), stages.join(", "));
         let _ =
@@ -244,7 +249,7 @@ fn counters(summary: &Summary, all: bool, text: &mut String) {
         let _ = writeln!(text, "scripted faults: acted {} times", books.injected_faults);
     }
     if books.rejected_samples > 0 {
-        let reasons = reasons(&books.rejected_by);
+        let reasons = if all { reasons(&books.rejected_by) } else { String::new() };
         let _ = writeln!(text, "{} samples rejected by their readers{reasons}", books.rejected_samples);
     }
     let met = |link: &&LinkCounters| link.published.is_none() || link.rejected + link.stale + link.void.1 > 0;
@@ -265,7 +270,8 @@ fn counters(summary: &Summary, all: bool, text: &mut String) {
         let _ = writeln!(text, "  {problem}");
     }
     if !books.unbooked.is_empty() {
-        let _ = writeln!(text, "no books of {}: its signals are counted by their readers", books.unbooked.join(", "));
+        let _ =
+            writeln!(text, "no accounting of {}: its signals are counted by their readers", books.unbooked.join(", "));
     }
     let _ = match state.first_disturbed_tick {
         None => {
@@ -312,7 +318,7 @@ fn hosts(summary: &HostsSummary, text: &mut String) {
         let ill = [
             (host.repeated_frames, "frames sent again"),
             (host.refused_frames, "frames without room"),
-            (host.malformed, "messages that are none"),
+            (host.malformed, "malformed messages"),
         ];
         let ill: Vec<String> =
             ill.iter().filter(|(count, _)| *count > 0).map(|(n, what)| format!("{n} {what}")).collect();

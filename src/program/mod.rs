@@ -56,7 +56,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Bodies move together although not everything about them can be measured.
+/// Run a feedback control loop as separate processes; measure, test and replay it
 #[derive(Parser)]
 #[command(term_width = WIDTH)]
 struct Arguments {

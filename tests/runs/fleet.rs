@@ -4,7 +4,7 @@
 use crate::common::{ANY_TICKS, Bench, await_some, send_signal, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Carried, Reader, Signal};
-use corotate::runtime::{Input, RoleId, depths, drive_in_turn, private_ledger, topic};
+use corotate::runtime::{Input, RoleId, depths, drive_in_turn, private_ledger, topic, window_ticks};
 use corotate::sample::{FleetTruth, RateTruth};
 use corotate::scenario::Scenario;
 use corotate::scenario::build;
@@ -192,6 +192,17 @@ fn a_fleet_flies_beside_single_followers() {
     assert_eq!(one, many);
     assert_eq!(summary["books"]["missed_ticks"], 0);
     assert!(summary["score"]["certificate"]["held"].as_u64().unwrap() > 100, "of the single ones: {summary:#}");
+}
+
+/// The samples of one signal that wait for one reader, over all bodies, do not grow with the bodies.
+#[test]
+fn many_bodies_run_less_far_ahead_in_lockstep() {
+    for (followers, window) in [(1, 64), (7, 64), (40, 12), (100, 5)] {
+        let follower = |index| format!("{{name='f{index}', initial_rate_rad_s=[0.1,0.2,0.3]}}");
+        let list: Vec<String> = (0..followers).map(follower).collect();
+        let scenario = Scenario::load(&shipped("rigid-pair"), &[format!("follower=[{}]", list.join(","))]).unwrap();
+        assert_eq!(window_ticks(&scenario), window, "{followers} followers");
+    }
 }
 
 #[test]

@@ -29,7 +29,7 @@ const UNIFORM: [(f64, f64); 2] = [(6.9, 1.6), (13.8, 1.15)];
 pub(super) struct Exponent {
     /// The rate at which the distance fell, 1/s, over all examined ticks but the first quarter.
     rate_per_s: f64,
-    /// The same over equal parts of these ticks, 1/s.
+    /// The rates over equal parts of these ticks, 1/s.
     parts_per_s: Vec<f64>,
     /// The slowest and the fastest of all falls by each depth of [`UNIFORM`], 1/s.
     local_per_s: [[f64; 2]; 2],

@@ -329,7 +329,7 @@ mod tests {
     }
 
     crate::sample! {
-        /// The same name with two fields swapped.
+        /// A sample with the type name of another and two fields swapped.
         Swapped = "test/Sample/v1" {
             /// Another field.
             current_a: f64,

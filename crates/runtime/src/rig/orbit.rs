@@ -362,7 +362,7 @@ impl Rig for OrbitRig {
         ]
     }
 
-    /// The same spacecraft under its law with the true velocity, \[S\] Fig. 1.
+    /// The overrides of the run to compare with: the law with the true velocity, \[S\] Fig. 1.
     fn counterpart(&self) -> &'static [&'static str] {
         let estimate = self.controller.is_some() && matches!(self.aim, Aim::Circle { full_state: false, .. });
         if estimate { &["controller.feedback=full-state"] } else { &[] }

@@ -58,7 +58,7 @@ pub enum LineError {
 /// A serial line, open or cut.
 pub struct Line {
     path: PathBuf,
-    /// The same path as a C string: reopening allocates nothing.
+    /// `path` as a C string, so that reopening does not allocate.
     name: CString,
     baud: Option<u32>,
     port: Option<OwnedFd>,

@@ -25,8 +25,8 @@ const MAX_BORROWED: usize = 2;
 /// Time limit of the transport for a file that another process creates. Longer than any maker is delayed, because the
 /// transport never retries a connection. The janitor ends the wait for a dead maker.
 const CREATION_TIMEOUT: Duration = Duration::from_secs(10);
-/// Connections to ended writers that a reader keeps until it has read their samples. A signal has one writer at a time,
-/// and a reader checks every one of these connections whenever it finds no new sample.
+/// Connections to ended writers that a reader keeps until it has read their samples; the transport discards the samples of
+/// further ones. More than a role's default restarts. A reader checks all these places whenever it finds no new sample.
 const EXPIRED_CONNECTIONS: usize = 8;
 /// The transport's version, which every process of a run must use, because the layout in shared memory depends on it.
 pub const VERSION: &str = "0.10.0";
