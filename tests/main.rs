@@ -1,6 +1,6 @@
-//! The whole-program tests: one program, which is compiled and linked once.
+//! The whole-program tests, compiled and linked as one program.
 //! `cargo test --release --test all hil::` runs those of `runs/hil.rs`.
-//! Tests run beside each other, so none may change what belongs to the whole process.
+//! Tests run in parallel threads: none may change the state of the process, such as its environment.
 
 mod common;
 #[path = "../benches/contest/main.rs"]

@@ -1,4 +1,4 @@
-//! A directory and a runtime directory for the programs of one test, and what they leave there.
+//! A working directory and a runtime directory for the programs of one test, and inspection of what they leave there.
 
 use super::process::{Done, Running, WATCHDOG, await_some, processes_marked};
 use super::{shipped, summary_in};
@@ -9,29 +9,29 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-/// A place to run in, with nothing of any other run in it.
+/// Private directories in which a test runs the program.
 pub struct Bench {
     directory: tempfile::TempDir,
     runtime: tempfile::TempDir,
-    /// The program that it runs.
+    /// The program under test.
     program: PathBuf,
-    /// The user to run as, if not this one.
+    /// The user to run as, if not the current one.
     user: Option<u32>,
 }
 
 impl Bench {
     pub fn new() -> Self {
-        Self::of(Path::new(env!("CARGO_BIN_EXE_corotate")))
+        Self::with_program(Path::new(env!("CARGO_BIN_EXE_corotate")))
     }
 
-    /// A bench of another program that is corotate with other rigs.
-    pub fn of(program: &Path) -> Self {
-        // Socket names limit the length of the runtime directory's path.
+    /// Creates a bench for another program, which is corotate with other rigs.
+    pub fn with_program(program: &Path) -> Self {
+        // The length of socket names limits the runtime directory's path.
         let runtime = tempfile::Builder::new().prefix("ct").rand_bytes(6).tempdir_in("/tmp").unwrap();
         Self { directory: tempfile::tempdir().unwrap(), runtime, program: program.to_owned(), user: None }
     }
 
-    /// A bench whose programs run as `nobody` where this process is root.
+    /// Creates a bench whose programs run as `nobody` if the test runs as root.
     pub fn unprivileged() -> Self {
         let mut bench = Self::new();
         if rustix::process::getuid().is_root() {
@@ -39,7 +39,7 @@ impl Bench {
             for directory in [&bench.directory, &bench.runtime] {
                 std::os::unix::fs::chown(directory.path(), Some(NOBODY), Some(NOBODY)).unwrap();
             }
-            // The build's own directory may be closed to others.
+            // Other users may not be able to read the build directory.
             std::fs::copy(&bench.program, bench.path("corotate")).unwrap();
             bench.program = bench.path("corotate");
             bench.user = Some(NOBODY);
@@ -51,7 +51,7 @@ impl Bench {
         self.directory.path().join(name)
     }
 
-    /// Where the domains of its programs lie, in a directory of the program's name.
+    /// Returns the runtime directory; the domains are below it, in a directory named after the program.
     pub fn runtime(&self) -> PathBuf {
         self.runtime.path().to_owned()
     }
@@ -60,7 +60,7 @@ impl Bench {
         self.command_of(&self.program)
     }
 
-    /// A command in this bench by another program than ours.
+    /// Returns a command of any program, run in this bench.
     pub fn command_of(&self, program: &Path) -> Command {
         let mut command = Command::new(program);
         if let Some(user) = self.user {
@@ -82,19 +82,19 @@ impl Bench {
         self.start(arguments).wait()
     }
 
-    /// Runs a shipped scenario and returns its summary; it must end well.
+    /// Runs a shipped scenario, which must succeed, and returns its summary.
     pub fn summary(&self, scenario: &str, arguments: &[&str]) -> Value {
         let file = self.path(&format!("{scenario}.toml"));
         std::fs::copy(shipped(scenario), &file).unwrap();
         self.run(&[&["run", file.to_str().unwrap(), "--json"], arguments].concat()).succeeded().json()
     }
 
-    /// The `summary.json` of a directory of results.
+    /// Returns the `summary.json` of a results directory.
     pub fn summary_in(&self, directory: &str) -> Value {
         summary_in(&self.path(directory))
     }
 
-    /// Starts a run that lasts until it is stopped, and waits until its ticks run.
+    /// Starts a run without end and waits until every role has executed a tick.
     pub fn start_endless(&self, arguments: &[&str]) -> Running {
         let endless = ["run", "rigid-pair", "--duration", "100000", "--out", "out", "--set", "accept={}"];
         let running = self.start(&[&endless[..], arguments].concat());
@@ -104,18 +104,18 @@ impl Bench {
         running
     }
 
-    /// The seat that a run of this bench leaves for a role, once it does.
+    /// Waits for the seat file of an external role and returns its path.
     pub fn await_seat(&self, role: &str) -> PathBuf {
         await_some(|| self.domains().iter().map(|domain| seat_path(domain, role)).find(|seat| seat.is_file()))
     }
 
-    /// The domains that exist in this bench's runtime directory.
+    /// Returns the domains in this bench's runtime directory.
     pub fn domains(&self) -> Vec<PathBuf> {
         let entries = std::fs::read_dir(self.runtime.path().join("corotate")).into_iter().flatten();
         entries.map(|entry| entry.unwrap().path()).filter(|path| path.is_dir()).collect()
     }
 
-    /// Asserts that no process, file or shared memory of any run in this bench is left; waits for the dying.
+    /// Waits until no process, file or shared memory of any run in this bench is left.
     pub fn assert_clean(&self, domains: &[PathBuf]) {
         let end = Instant::now() + WATCHDOG;
         while !self.left(domains).is_empty() {
@@ -124,7 +124,7 @@ impl Bench {
         }
     }
 
-    /// The processes, files and shared memory of runs in this bench and of these domains.
+    /// Returns the processes, files and shared memory of runs in this bench and of these domains.
     pub fn left(&self, domains: &[PathBuf]) -> Vec<PathBuf> {
         let ids: Vec<String> =
             domains.iter().map(|path| path.file_name().unwrap().to_string_lossy().into_owned()).collect();
@@ -138,44 +138,44 @@ impl Bench {
         left
     }
 
-    /// The entry in the environment by which every process of this bench is known.
+    /// Returns the environment entry that identifies every process of this bench.
     pub fn mark(&self) -> String {
         format!("XDG_RUNTIME_DIR={}", self.runtime.path().display())
     }
 
-    /// Every process of the program that runs in this bench, zombies apart.
+    /// Returns every process in this bench except zombies.
     pub fn processes(&self) -> Vec<u32> {
         processes_marked(&self.mark())
     }
 
-    /// The process of a role, once it runs.
+    /// Waits for the process of a role and returns it.
     pub fn await_role(&self, role: &str) -> u32 {
         await_some(|| self.role(role))
     }
 
-    /// The process of a role, once it has executed ticks.
+    /// Waits until a role has executed a tick and returns its process.
     pub fn await_ticks(&self, role: &str) -> u32 {
         let process = self.await_role(role);
         self.await_commits(role, 1);
         process
     }
 
-    /// Waits until a role has committed its state so often.
+    /// Waits until a role has committed its state the given number of times.
     pub fn await_commits(&self, role: &str, commits: u64) {
         await_some(|| (self.commits(role) >= commits).then_some(()));
     }
 
-    /// How often a role has committed its state: the second word of its ledger, in each tick once.
+    /// Returns how many ticks a role has committed: the second word of its persistent state.
     pub fn commits(&self, role: &str) -> u64 {
-        let ledger = format!("shared/{role}.books");
+        let state = format!("shared/{role}.books");
         let word = |domain: PathBuf| {
-            let bytes = std::fs::read(domain.join(&ledger)).ok()?;
+            let bytes = std::fs::read(domain.join(&state)).ok()?;
             Some(u64::from_ne_bytes(bytes.get(8..16)?.try_into().ok()?))
         };
         self.domains().into_iter().filter_map(word).max().unwrap_or(0)
     }
 
-    /// The process of a role, if it runs.
+    /// Returns the process of a role if it is running.
     pub fn role(&self, role: &str) -> Option<u32> {
         let is_role = |pid: &u32| {
             let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
@@ -187,7 +187,7 @@ impl Bench {
     }
 }
 
-/// Whoever cleans up after a test that failed needs the directory until that is done.
+/// After a failed test, keeps the directories until the processes that clean up have ended.
 impl Drop for Bench {
     fn drop(&mut self) {
         let end = Instant::now() + Duration::from_secs(10);

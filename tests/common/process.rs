@@ -1,4 +1,4 @@
-//! Programs that run and have ended, signals to them, and waiting under a watchdog.
+//! Running and ended programs, signals, and waiting under a watchdog.
 
 use super::bench::Bench;
 use serde_json::Value;
@@ -8,7 +8,7 @@ use std::process::{Child, Command, Stdio};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Nothing here takes so long, however loaded the machine is; what does, hangs.
+/// The limit on every wait. On the most loaded machine only a hang takes longer.
 pub const WATCHDOG: Duration = Duration::from_secs(300);
 
 /// A program that is running.
@@ -27,7 +27,7 @@ pub struct Done {
     pub stderr: String,
 }
 
-/// A test that fails leaves no run behind: the roles die with their launcher, and the janitor cleans up.
+/// Kills the launcher if the test fails: the roles die with it, and the janitor cleans up.
 impl Drop for Running {
     fn drop(&mut self) {
         let _ = self.child.kill();
@@ -39,7 +39,7 @@ impl Running {
     pub fn new(command: &mut Command) -> Self {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = await_some(|| match command.spawn() {
-            // Another test's child held the copied program open for writing when it was forked; it execs soon.
+            // A child forked by another test still holds the copied program open for writing, until its exec.
             Err(error) if error.kind() == std::io::ErrorKind::ExecutableFileBusy => None,
             spawned => Some(spawned.unwrap()),
         });
@@ -56,7 +56,7 @@ impl Running {
         send_signal(self.pid(), signal);
     }
 
-    /// The process of a role, once it runs, unless the program ends before.
+    /// Waits for the process of a role; `None` if the program ends first.
     pub fn await_role_or_end(&mut self, bench: &Bench, role: &str) -> Option<u32> {
         await_some(|| match bench.role(role) {
             Some(pid) => Some(Some(pid)),
@@ -88,14 +88,14 @@ impl Running {
 }
 
 impl Done {
-    /// Asserts that the program ended well.
+    /// Asserts exit code 0.
     #[track_caller]
     pub fn succeeded(self) -> Self {
         assert_eq!(self.code, Some(0), "{self:?}");
         self
     }
 
-    /// The codes of the errors that it printed, in their order. All of them are in the manual.
+    /// Returns the codes of the printed errors in order, and asserts that the manual lists each.
     #[track_caller]
     pub fn codes(&self) -> Vec<&str> {
         let codes: Vec<&str> = self.stderr.lines().filter_map(code_of).collect();
@@ -104,20 +104,28 @@ impl Done {
         codes
     }
 
-    /// Returns true if it printed an error of this code.
+    /// Returns true if an error with this code was printed.
     #[track_caller]
     pub fn says(&self, code: &str) -> bool {
         self.codes().contains(&code)
     }
 
-    /// What it printed, as JSON.
+    /// Returns the number of roles of `replay --json` whose samples were all compared and equal.
+    #[track_caller]
+    pub fn roles_replayed(&self) -> usize {
+        let replay = self.json();
+        let roles = replay["roles"].as_array().unwrap().iter();
+        roles.filter(|role| role["same"] == true && role["limit"].is_null()).count()
+    }
+
+    /// Parses stdout as JSON.
     #[track_caller]
     pub fn json(&self) -> Value {
         serde_json::from_str(&self.stdout).unwrap_or_else(|error| panic!("{error}: {self:?}"))
     }
 }
 
-/// The code that ends an error's line, in brackets.
+/// Returns the code in brackets at the end of an error's line.
 pub fn code_of(line: &str) -> Option<&str> {
     let (_, code) = line.strip_suffix(']')?.rsplit_once(" [")?;
     let plain = code.bytes().all(|letter| letter.is_ascii_lowercase() || letter.is_ascii_digit() || letter == b'-');
@@ -132,7 +140,7 @@ fn collect(mut pipe: impl Read + Send + 'static) -> JoinHandle<String> {
     })
 }
 
-/// Every process with this entry in its environment, zombies apart.
+/// Returns every process with this entry in its environment, except zombies.
 pub fn processes_marked(mark: &str) -> Vec<u32> {
     let pids = std::fs::read_dir("/proc").unwrap().filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
     pids.filter(|pid: &u32| {
@@ -142,14 +150,14 @@ pub fn processes_marked(mark: &str) -> Vec<u32> {
     .collect()
 }
 
-/// What a process's status says of it, the like of `State` and `SigCgt`; empty if it has ended.
+/// Returns a field of a process's status, such as `State` or `SigCgt`; empty if the process has ended.
 pub fn status_of(pid: u32, field: &str) -> String {
     let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
-    let told = status.lines().find_map(|line| line.strip_prefix(field)?.strip_prefix(':'));
-    told.unwrap_or_default().trim().to_owned()
+    let value = status.lines().find_map(|line| line.strip_prefix(field)?.strip_prefix(':'));
+    value.unwrap_or_default().trim().to_owned()
 }
 
-/// Whether a process has a handler for a signal.
+/// Returns true if a process has a handler for a signal.
 pub fn catches(pid: u32, signal: i32) -> bool {
     u64::from_str_radix(&status_of(pid, "SigCgt"), 16).is_ok_and(|caught| caught >> (signal - 1) & 1 == 1)
 }
@@ -160,14 +168,14 @@ pub fn send_signal(pid: u32, signal: i32) {
     let _ = rustix::process::kill_process(pid, signal);
 }
 
-/// Polls until there is something, under the watchdog.
+/// Polls until `look` returns a value, under the watchdog.
 pub fn await_some<T>(mut look: impl FnMut() -> Option<T>) -> T {
     let end = Instant::now() + WATCHDOG;
     loop {
         if let Some(found) = look() {
             return found;
         }
-        assert!(Instant::now() < end, "it never came");
+        assert!(Instant::now() < end, "waited in vain");
         std::thread::sleep(Duration::from_millis(2));
     }
 }

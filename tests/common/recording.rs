@@ -1,17 +1,17 @@
-//! Rewrites recordings with something changed in them.
+//! Writes changed copies of recordings.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// A writer of chunks of the kind that the program writes.
+/// Creates a writer of chunks like those of the program.
 fn rewriter(to: &Path) -> mcap::Writer<std::io::BufWriter<std::fs::File>> {
     let options = mcap::WriteOptions::new().compression(Some(mcap::Compression::Lz4));
     options.create(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap()
 }
 
-/// Writes a recording again, as anybody could, with something changed: schemas, and the samples of one topic by tick; what is
-/// made empty is left out.
+/// Writes a copy of a recording, as any MCAP tool could, with changed schemas and samples (by topic and tick). Samples
+/// made empty are left out.
 pub fn rewrite(from: &Path, to: &Path, schema: impl Fn(String) -> String, change: impl Fn(&str, u32, &mut Vec<u8>)) {
     let bytes = std::fs::read(from).unwrap();
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
@@ -22,9 +22,9 @@ pub fn rewrite(from: &Path, to: &Path, schema: impl Fn(String) -> String, change
     for message in mcap::MessageStream::new(&bytes).unwrap() {
         let mut message = message.unwrap();
         let mut channel = (*message.channel).clone();
-        let mut of = (**channel.schema.as_ref().unwrap()).clone();
-        of.data = Cow::Owned(schema(String::from_utf8(of.data.to_vec()).unwrap()).into_bytes());
-        channel.schema = Some(of.into());
+        let mut layout = (**channel.schema.as_ref().unwrap()).clone();
+        layout.data = Cow::Owned(schema(String::from_utf8(layout.data.to_vec()).unwrap()).into_bytes());
+        channel.schema = Some(layout.into());
         let mut data = message.data.to_vec();
         change(&channel.topic, message.sequence, &mut data);
         message.channel = channel.into();
@@ -36,7 +36,7 @@ pub fn rewrite(from: &Path, to: &Path, schema: impl Fn(String) -> String, change
     writer.finish().unwrap();
 }
 
-/// Writes a recording again, as anybody could, with its metadata changed and their checksums made right again.
+/// Writes a copy of a recording, as any MCAP tool could, with changed metadata and correct checksums.
 pub fn rewrite_metadata(from: &Path, to: &Path, change: impl Fn(&str, &mut BTreeMap<String, String>)) {
     let bytes = std::fs::read(from).unwrap();
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();

@@ -75,7 +75,7 @@ fn too_few_inodes_are_refused_before_the_run() {
         let line = format!("{mount} && {} --record", short_run("lockstep"));
         let done = start_in_shell(&bench, &format!("exec {unshare} /bin/sh -c '{line}'")).wait();
         assert!(done.code.is_some_and(|code| codes.contains(&code)), "{inodes}: {done:?}");
-        assert!(done.code == Some(0) || done.stderr.contains("/dev/shm has room for"), "{inodes}: {done:?}");
+        assert!(done.code == Some(0) || done.stderr.contains("/dev/shm"), "{inodes}: {done:?}");
         bench.assert_clean(&[]);
     }
 }
@@ -117,8 +117,8 @@ fn results_that_cannot_be_written_are_reported_and_still_shown() {
         symlink("/dev/full", bench.path("out").join(file)).unwrap();
         let done = running.wait();
         assert_eq!(done.code, Some(1), "{file}: {done:?}");
-        assert!(done.stderr.contains(file) && done.stderr.contains("No space left"), "{file}: {done:?}");
-        assert!(done.stdout.contains("counters balance"), "{file}: {done:?}");
+        assert!(done.stderr.contains(file) && done.says("cannot-write"), "{file}: {done:?}");
+        assert!(done.stdout.contains("state hash"), "{file}: {done:?}");
         bench.assert_clean(&[]);
     }
     let bench = Bench::new();
@@ -135,7 +135,7 @@ fn results_that_cannot_be_written_are_reported_and_still_shown() {
     std::fs::remove_dir_all(bench.path("out")).unwrap();
     let done = running.wait();
     assert_eq!(done.code, Some(1), "{done:?}");
-    assert!(done.says("cannot-write") && done.stdout.contains("counters balance"), "{done:?}");
+    assert!(done.says("cannot-write") && done.stdout.contains("state hash"), "{done:?}");
 }
 
 #[test]
@@ -160,10 +160,10 @@ fn a_pause_of_two_seconds_is_counted_without_incidents() {
     let running =
         bench.start(&["run", file.to_str().unwrap(), "--json", "--duration=5", "--set=accept={}", "--out=out"]);
     bench.await_ticks("controller");
-    let everybody = bench.processes();
-    everybody.iter().for_each(|pid| send_signal(*pid, SIGSTOP));
+    let processes = bench.processes();
+    processes.iter().for_each(|pid| send_signal(*pid, SIGSTOP));
     std::thread::sleep(Duration::from_secs(2));
-    everybody.iter().for_each(|pid| send_signal(*pid, SIGCONT));
+    processes.iter().for_each(|pid| send_signal(*pid, SIGCONT));
     let done = running.wait().succeeded();
     let summary = done.json();
     assert_eq!(summary["incidents"].as_array().unwrap().len(), 0, "{summary:#}");

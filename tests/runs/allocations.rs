@@ -1,5 +1,5 @@
-//! The hot path allocates nothing of our own: between the first tick and the report of every role, counted by the
-//! allocator itself. iceoryx2 makes one small allocation per loan; it is counted apart, and is off the critical path.
+//! The hot path of a role allocates nothing between its first and last tick, as counted by a global allocator. iceoryx2
+//! makes one small allocation per loan, off the critical path, which is counted separately.
 
 use corotate::bus::domain::OwnedDomain;
 use corotate::bus::iox::IoxBus;
@@ -22,29 +22,28 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-/// What this thread counts, and where.
+/// The counters of this thread.
 #[derive(Clone, Copy)]
 struct Count {
     armed: bool,
     in_prepare: bool,
     prepares: u64,
-    of_ours: u64,
-    of_the_transport: u64,
-    /// `of_ours` at the last real sample: what the report takes afterwards is not of the loop.
-    of_ours_in_the_loop: u64,
+    ours: u64,
+    transport: u64,
+    /// `ours` at the last real sample: the report, which allocates, is not part of the loop.
+    ours_in_loop: u64,
 }
 
 impl Count {
-    const NOTHING: Self =
-        Self { armed: false, in_prepare: false, prepares: 0, of_ours: 0, of_the_transport: 0, of_ours_in_the_loop: 0 };
+    const ZERO: Self = Self { armed: false, in_prepare: false, prepares: 0, ours: 0, transport: 0, ours_in_loop: 0 };
 }
 
 thread_local! {
-    static COUNT: Cell<Count> = const { Cell::new(Count::NOTHING) };
+    static COUNT: Cell<Count> = const { Cell::new(Count::ZERO) };
 }
 
 fn update(change: impl FnOnce(&mut Count)) {
-    // The allocator is also called while a thread is being taken down.
+    // The allocator is also called while a thread's local values are destroyed.
     let _ = COUNT.try_with(|count| {
         let mut value = count.get();
         change(&mut value);
@@ -55,22 +54,22 @@ fn update(change: impl FnOnce(&mut Count)) {
 struct CountingAllocator;
 
 #[allow(unsafe_code)]
-// SAFETY: every call is passed on unchanged to the system's allocator; counting touches a thread-local cell only.
+// SAFETY: every call is passed on unchanged to the system's allocator; counting only changes a thread-local cell.
 unsafe impl GlobalAlloc for CountingAllocator {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         update(|count| {
             if count.armed && count.in_prepare {
-                count.of_the_transport += 1;
+                count.transport += 1;
             } else if count.armed {
-                count.of_ours += 1;
+                count.ours += 1;
             }
         });
-        // SAFETY: the caller's promises about `layout` are the system allocator's.
+        // SAFETY: the caller guarantees for `layout` what the system allocator requires.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: `pointer` came from `alloc` above, which is the system's.
+        // SAFETY: `pointer` came from `alloc` above, that is from the system's allocator.
         unsafe { System.dealloc(pointer, layout) }
     }
 }
@@ -78,7 +77,7 @@ unsafe impl GlobalAlloc for CountingAllocator {
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
 
-/// The real bus, with the counting switched on by the first real sample that a role sends.
+/// The real bus; the first real sample that a role sends starts the counting.
 struct CountedBus(IoxBus);
 struct CountedWriter<W>(W);
 
@@ -119,7 +118,7 @@ impl<S: Carried + ?Sized, W: Write<S>> Write<S> for CountedWriter<W> {
             real = S::type_name() != Health::TYPE_NAME && sample.stamp().generation != 0;
         })?;
         if real {
-            update(|count| (count.armed, count.of_ours_in_the_loop) = (true, count.of_ours));
+            update(|count| (count.armed, count.ours_in_loop) = (true, count.ours));
         }
         Ok(())
     }
@@ -143,7 +142,7 @@ impl<S: Carried + ?Sized, W: Write<S>> Write<S> for CountedWriter<W> {
     }
 }
 
-/// Serves one role in this thread and gives its report and what it allocated.
+/// Serves one role in this thread; returns its report and its allocations.
 fn count_role(scenario: &Scenario, role_impl: impl Into<RoleImpl>, domain: &OwnedDomain) -> (RoleReport, Count) {
     let role_impl = role_impl.into();
     let role = role_impl.role();
@@ -162,7 +161,7 @@ fn count_role(scenario: &Scenario, role_impl: impl Into<RoleImpl>, domain: &Owne
     result.unwrap()
 }
 
-/// Leads the roles through a real-time run as the launcher does.
+/// Leads the roles through a real-time run like the launcher.
 fn conduct(scenario: &Scenario, domain: &OwnedDomain) {
     let bus = IoxBus::enter(domain.domain(), "conductor", depths(scenario)).unwrap();
     let mut schedule = bus.writer::<Schedule>(&topic(scenario, "run", Signal::Schedule), 1).unwrap();
@@ -191,7 +190,7 @@ fn conduct(scenario: &Scenario, domain: &OwnedDomain) {
     schedule.send(|word| word.phase = Phase::Stop as u64).unwrap();
 }
 
-/// A pty: the device's end, and the path of the bridge's.
+/// Opens a pty; returns the device's end and the path of the bridge's end.
 fn line() -> (OwnedFd, PathBuf) {
     let far = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
     grantpt(&far).unwrap();
@@ -200,25 +199,25 @@ fn line() -> (OwnedFd, PathBuf) {
     (far, PathBuf::from(name.to_str().unwrap()))
 }
 
-/// A device with these roles of the scenario, until the other end hangs up.
+/// Runs a device with these roles of the scenario until the other end hangs up.
 fn device(scenario: &Scenario, roles: &[RoleId], far: &OwnedFd) {
     with_shipped_rig!(scenario.rig, rig => match roles {
-        [RoleId::Plant(index)] => live(|hello| Some(DevicePlant::new(rig.body(*index), hello)), far),
-        _ => live(|hello| Some(DeviceFlightComputer::new(rig.estimator(), [rig.law(1)], hello)), far),
+        [RoleId::Plant(index)] => serve_device(|hello| Some(DevicePlant::new(rig.body(*index), hello)), far),
+        _ => serve_device(|hello| Some(DeviceFlightComputer::new(rig.estimator(), [rig.law(1)], hello)), far),
     })
 }
 
-fn live<S: DeviceRole>(seat: impl FnMut(&Hello<'_>) -> Option<S>, far: &OwnedFd) {
-    let (mut device, mut bytes) = (Device::new("test", seat), [0; 512]);
+fn serve_device<S: DeviceRole>(create: impl FnMut(&Hello<'_>) -> Option<S>, far: &OwnedFd) {
+    let (mut device, mut bytes) = (Device::new("test", create), [0; 512]);
     while let Ok(count @ 1..) = rustix::io::read(far, &mut bytes) {
         device.receive(&bytes[..count], 0, |frame| assert_eq!(rustix::io::write(far, frame), Ok(frame.len())));
     }
 }
 
-/// The link to that device, greeted.
-fn linked(scenario: &Scenario, roles: &[RoleId], path: &Path) -> RoleImpl {
+/// Opens the link to that device and exchanges greetings.
+fn link_device(scenario: &Scenario, roles: &[RoleId], path: &Path) -> RoleImpl {
     let names = roles.iter().map(|role| role.name(scenario).to_owned()).collect();
-    let seat = DeviceConfig {
+    let config = DeviceConfig {
         domain: PathBuf::new(),
         roles: names,
         path: path.to_owned(),
@@ -226,17 +225,17 @@ fn linked(scenario: &Scenario, roles: &[RoleId], path: &Path) -> RoleImpl {
         patience_s: 60.0,
         other_device: false,
     };
-    let mut link = DeviceLink::open(&seat, scenario, roles, 1).unwrap();
+    let mut link = DeviceLink::open(&config, scenario, roles, 1).unwrap();
     assert!(link.greet(None, &AtomicBool::new(false)).unwrap().is_some());
-    let (last, others) = roles.split_last().unwrap();
-    let others = others.iter().map(|other| (*other, private_ledger(scenario, *other))).collect();
-    RoleImpl::Device(*last, others, Box::new(link))
+    let (last, rest) = roles.split_last().unwrap();
+    let rest = rest.iter().map(|role| (*role, private_ledger(scenario, *role))).collect();
+    RoleImpl::Device(*last, rest, Box::new(link))
 }
 
-/// What every process counts; a device has the roles given, if there are any.
+/// Returns the counts of every process; the roles `in_device` run in a device.
 fn counts(text: &str, in_device: &[RoleId], processes: &str) -> Vec<(RoleReport, Count)> {
     let processes = format!("launch.processes={processes}");
-    // So slow that a device is heard on any machine.
+    // With a device, slow enough for any machine.
     let (tick, duration) =
         if in_device.is_empty() { ("tick_hz=1000", "duration_s=1") } else { ("tick_hz=200", "duration_s=4") };
     let overrides = ["clock=realtime", tick, duration, "accept={}", "fault=[]", "watchdog={}", &processes];
@@ -256,12 +255,12 @@ fn counts(text: &str, in_device: &[RoleId], processes: &str) -> Vec<(RoleReport,
             .map(|role| match role {
                 role if in_device.last() == Some(role) => {
                     by_device = Some(scope.spawn(|| device(scenario, in_device, &far)));
-                    scope.spawn(move || count_role(scenario, linked(scenario, in_device, path), domain))
+                    scope.spawn(move || count_role(scenario, link_device(scenario, in_device, path), domain))
                 }
                 role => scope.spawn(move || {
-                    let others = role.process_members(scenario).into_iter().filter(|other| other != role);
-                    let others = others.map(|other| (other, private_ledger(scenario, other))).collect();
-                    count_role(scenario, RoleImpl::Role(*role, others), domain)
+                    let rest = role.process_members(scenario).into_iter().filter(|member| member != role);
+                    let rest = rest.map(|member| (member, private_ledger(scenario, member))).collect();
+                    count_role(scenario, RoleImpl::Role(*role, rest), domain)
                 }),
             })
             .collect();
@@ -274,28 +273,28 @@ fn counts(text: &str, in_device: &[RoleId], processes: &str) -> Vec<(RoleReport,
     })
 }
 
-fn assert_none(name: &str, counts: Vec<(RoleReport, Count)>) {
+fn assert_no_allocation(name: &str, counts: Vec<(RoleReport, Count)>) {
     for (report, count) in counts {
         let ticks = report.ticks.executed;
         println!(
             "{name} {}: {ticks} ticks, {} allocations of ours, {} of iceoryx2 in {} loans",
-            report.role, count.of_ours_in_the_loop, count.of_the_transport, count.prepares
+            report.role, count.ours_in_loop, count.transport, count.prepares
         );
         assert!(count.armed && ticks > 0, "{name} {}: nothing was counted", report.role);
-        assert_eq!(count.of_ours_in_the_loop, 0, "{name} {}", report.role);
-        assert!(count.of_the_transport <= count.prepares, "{name} {}: one per loan at most", report.role);
+        assert_eq!(count.ours_in_loop, 0, "{name} {}", report.role);
+        assert!(count.transport <= count.prepares, "{name} {}: one per loan at most", report.role);
     }
 }
 
 #[test]
 fn no_role_allocates_between_its_first_tick_and_its_last() {
     for (name, text) in corotate::config::SHIPPED {
-        assert_none(name, counts(text, &[], "[]"));
+        assert_no_allocation(name, counts(text, &[], "[]"));
     }
 }
 
 #[test]
-fn neither_does_a_process_of_several_roles() {
+fn a_process_of_several_roles_does_not_allocate() {
     let (name, text) = corotate::config::SHIPPED[0];
     for (processes, count) in [
         ("[['observer', 'controller']]", 3),
@@ -304,16 +303,16 @@ fn neither_does_a_process_of_several_roles() {
     ] {
         let counts = counts(text, &[], processes);
         assert_eq!(counts.len(), count, "{processes}");
-        assert_none(name, counts);
+        assert_no_allocation(name, counts);
     }
 }
 
 #[test]
-fn neither_does_a_bridge_to_a_device() {
+fn a_bridge_to_a_device_does_not_allocate() {
     let (name, text) = corotate::config::SHIPPED[0];
     for roles in [&[RoleId::Plant(1)][..], &[RoleId::Observer, RoleId::Controller]] {
         let counts = counts(text, roles, "[]");
         assert!(roles.len() > 1 || counts.iter().any(|(report, _)| report.role == "follower" && report.line.is_some()));
-        assert_none(name, counts);
+        assert_no_allocation(name, counts);
     }
 }

@@ -1,5 +1,5 @@
-//! Roles whose samples a function computes: the same bits as the built-in ones if it computes the same, in one thread step by step
-//! and as a process of a run.
+//! Roles computed by a function of the caller: the same bits as built-in roles if the function computes the same, in one
+//! thread step by step and as a process of a run.
 
 use crate::common::{Bench, Running, await_some};
 use bytemuck::{bytes_of, from_bytes};
@@ -26,21 +26,21 @@ fn hash(scenario: &Scenario, outcome: &Outcome) -> String {
     serde_json::to_value(summary).unwrap()["state"]["hash"].as_str().unwrap().to_owned()
 }
 
-/// The rig's own laws, called by somebody else.
+/// The rig's own laws, called from outside the library.
 struct Laws(Vec<<R as Rig>::Law>);
 
 impl Laws {
-    fn of(scenario: &Scenario) -> Self {
+    fn new(scenario: &Scenario) -> Self {
         let rig = scenario.rig.downcast_ref::<R>().unwrap();
         Self((1..rig.bodies().len()).map(|index| rig.law(index)).collect())
     }
 
-    /// The content of each command.
+    /// Computes the content of each command.
     fn commands(&mut self, inputs: &[Option<&[u64]>]) -> Vec<Vec<u64>> {
         let estimate: &Estimate<R> = from_bytes(bytemuck::cast_slice(inputs[0].unwrap()));
         let command = |(law, input): (&mut <R as Rig>::Law, &Option<&[u64]>)| {
             let mut command = Command::<R>::default();
-            // In real time one may be missing.
+            // In real time a measurement may be missing.
             if let Some(words) = input {
                 let measurement: &Measurement<R> = from_bytes(bytemuck::cast_slice(words));
                 law.command(estimate, measurement, &mut command);
@@ -62,12 +62,12 @@ impl RoleFunction for Laws {
 }
 
 #[test]
-fn a_run_that_is_stepped_has_the_bits_of_one_that_is_not() {
+fn a_stepped_run_equals_a_normal_run_bit_by_bit() {
     for name in ["rigid-pair", "rigid-trio", "noisy-pair", "gyro-loss"] {
-        let of_run = || scenario(name, &["clock=in-process", "accept={}", "duration_s=3"]);
-        let scenario = of_run();
-        let mut steps = Steps::new(of_run()).unwrap();
-        let mut laws = Laws::of(&scenario);
+        let create = || scenario(name, &["clock=in-process", "accept={}", "duration_s=3"]);
+        let scenario = create();
+        let mut steps = Steps::new(create()).unwrap();
+        let mut laws = Laws::new(&scenario);
         while steps.observe().unwrap() {
             let inputs: Vec<Option<&[u64]>> = steps.inputs().iter().map(Option::as_deref).collect();
             let commands = laws.commands(&inputs);
@@ -82,7 +82,7 @@ fn a_run_that_is_stepped_has_the_bits_of_one_that_is_not() {
 }
 
 #[test]
-fn what_cannot_be_stepped_says_why() {
+fn a_scenario_that_cannot_be_stepped_is_refused_with_a_reason() {
     for (name, set, reason) in [("rigid-fleet", "accept={}", "fleet"), ("inertia", "accept={}", "no controller")] {
         let error = Steps::new(scenario(name, &["clock=in-process", set])).err().unwrap();
         assert!(error.to_string().contains(reason), "{error}");
@@ -97,16 +97,15 @@ fn what_cannot_be_stepped_says_why() {
             Err(error) => break error,
         }
     };
-    assert!(error.to_string().contains("a fault kills"), "{error}");
+    assert!(error.to_string().contains("kills"), "{error}");
 }
 
-/// A controller in this process, in a run of another.
+/// The controller runs in this process, the run in another.
 #[test]
-fn a_controller_of_ones_own_has_the_bits_of_the_built_in_one() {
+fn a_foreign_controller_equals_the_built_in_one_bit_by_bit() {
     let bench = Bench::new();
     let quick = ["--set", "accept={}", "--duration", "3", "--json"];
     let alone = bench.run(&[&["run", "rigid-pair", "--clock", "in-process"], &quick[..]].concat());
-    let told = |text: &str| serde_json::from_str::<serde_json::Value>(text).unwrap();
     for clock in ["lockstep", "realtime"] {
         let running =
             bench.start(&[&["run", "rigid-pair", "--clock", clock, "--external", "controller"], &quick[..]].concat());
@@ -115,22 +114,22 @@ fn a_controller_of_ones_own_has_the_bits_of_the_built_in_one() {
             let seat = domain.join("controller.seat.json");
             seat.exists().then(|| RoleAddress { domain: domain.clone(), role: "controller".to_owned() })
         });
-        let laws = Laws::of(&scenario("rigid-pair", &[]));
+        let laws = Laws::new(&scenario("rigid-pair", &[]));
         run_function(&seat, Box::new(laws), &AtomicBool::new(false)).unwrap();
         let done = running.wait().succeeded();
-        let (own, built_in) = (told(&done.stdout), told(&alone.stdout));
+        let (own, built_in) = (done.json(), alone.json());
         if own["state"]["first_disturbed_tick"].is_null() {
             assert_eq!(own["state"]["hash"], built_in["state"]["hash"], "{clock}");
         }
         assert!(clock == "realtime" || own["state"]["first_disturbed_tick"].is_null());
-        // How many in real time is up to the machine.
+        // In real time the number depends on the machine.
         let least = if clock == "realtime" { 0 } else { 2000 };
         assert!(own["books"]["roles"]["controller"]["executed"].as_u64().unwrap() > least, "{own:#}");
         bench.assert_clean(&[domain]);
     }
 }
 
-/// A run that waits for a controller of this process.
+/// Starts a run that waits for a controller of this process.
 fn start_waiting(bench: &Bench, options: &[&str]) -> (Running, RoleAddress) {
     let waits = ["run", "rigid-pair", "--external", "controller", "--set", "accept={}", "--json"];
     let running = bench.start(&[&waits[..], options].concat());
@@ -138,10 +137,9 @@ fn start_waiting(bench: &Bench, options: &[&str]) -> (Running, RoleAddress) {
     (running, RoleAddress { domain, role: "controller".to_owned() })
 }
 
-/// A function that fails ends its role with what it says, and the run in order, whatever the tick and the clock: by what it
-/// says and not by its silence, which is never long enough here.
+/// The error itself ends the run, not the silence that follows: the heartbeat timeout is an hour.
 #[test]
-fn a_function_that_fails_ends_the_run_in_order() {
+fn an_error_of_the_function_ends_the_run_in_order() {
     struct Fails(u64);
     impl RoleFunction for Fails {
         fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String> {
@@ -159,17 +157,17 @@ fn a_function_that_fails_ends_the_run_in_order() {
         let summary = done.json();
         let incident = &summary["incidents"][0];
         assert_eq!(incident["last_words"], "it cannot divide by zero", "{incident}");
-        // In real time the ticks before may have been missed, and are counted with the next that is executed.
+        // In real time earlier ticks may have been missed; they are counted with the next executed one.
         assert!(clock == "realtime" || incident["tick"] == tick, "{incident}");
         assert_eq!(summary["accepted"], false, "a run that lost a role is not accepted");
         bench.assert_clean(&[seat.domain]);
     }
 }
 
-/// In lockstep a function that is slow once is waited for, however short the heartbeat's timeout; with a limit the run ends, at the
-/// tick that the function is at, and the function is told that it was late.
+/// Lockstep waits longer than the heartbeat timeout. If `launch.external_timeout_s` is shorter, the run ends at the tick
+/// of the function, which gets an error.
 #[test]
-fn a_function_that_is_slow_is_waited_for_in_lockstep() {
+fn lockstep_waits_for_a_slow_function_up_to_the_external_timeout() {
     struct Slow;
     impl RoleFunction for Slow {
         fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String> {
@@ -192,7 +190,7 @@ fn a_function_that_is_slow_is_waited_for_in_lockstep() {
             served.unwrap();
             assert_eq!(summary["incidents"], serde_json::json!([]));
         } else {
-            // It may be back before the run is gone; its launcher was not killed.
+            // It may return before the run has ended; its launcher was not killed.
             assert!(matches!(served, Ok(()) | Err(RoleError::Late)), "{served:?}");
             assert_eq!(summary["incidents"][0]["tick"], 50, "{summary:#}");
         }

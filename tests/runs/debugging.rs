@@ -1,4 +1,4 @@
-//! Roles that stand still because a signal or a debugger has stopped them.
+//! Roles stopped by a signal or a debugger.
 
 use crate::common::{self, Bench, Done, await_some, send_signal};
 use libc::SIGINT;
@@ -8,7 +8,7 @@ use std::time::Duration;
 
 const STOP: i32 = 19;
 const CONT: i32 = 18;
-/// A run in lockstep that is not over before it is stopped; silence is limited to less than a stop lasts.
+/// A lockstep run, long enough to stop a role in it, with a heartbeat timeout shorter than a stop.
 const LOCKSTEP: [&str; 9] = [
     "run",
     "rigid-pair",
@@ -20,19 +20,19 @@ const LOCKSTEP: [&str; 9] = [
     "supervision.heartbeat_timeout_s=0.5",
     "--json",
 ];
-/// Longer than the limit on silence.
+/// Duration of a stop: longer than the heartbeat timeout.
 const STOPPED: Duration = Duration::from_millis(1500);
 
-/// Returns the summary of a run that ended with an exit code, without an incident.
+/// Asserts an exit code and that there was no incident; returns the summary.
 fn undisturbed(done: &Done, code: i32) -> Value {
-    let told = done.json();
-    assert_eq!((done.code, &told["incidents"]), (Some(code), &serde_json::json!([])), "{}", done.stderr);
-    told
+    let summary = done.json();
+    assert_eq!((done.code, &summary["incidents"]), (Some(code), &serde_json::json!([])), "{}", done.stderr);
+    summary
 }
 
-/// Without an incident, and with the bits of a run that nobody stopped.
+/// There is no incident, and the hash is that of an undisturbed run.
 #[test]
-fn a_stopped_role_is_waited_for_in_lockstep() {
+fn lockstep_waits_for_a_stopped_role() {
     let bench = Bench::new();
     let plain = bench.run(&[&LOCKSTEP[..2], &["--clock", "in-process", "--duration", "30", "--json"]].concat());
     for role in ["controller", "leader"] {
@@ -42,28 +42,29 @@ fn a_stopped_role_is_waited_for_in_lockstep() {
         std::thread::sleep(STOPPED);
         send_signal(pid, CONT);
         let done = run.wait();
-        let told = undisturbed(&done, 0);
-        assert_eq!(told["state"]["hash"], plain.json()["state"]["hash"]);
-        let lines = |words: &str| done.stderr.lines().filter(|line| line.contains(words)).count();
-        assert_eq!((lines("stopped by a signal"), lines("goes on after")), (1, 1), "{}", done.stderr);
+        let summary = undisturbed(&done, 0);
+        assert_eq!(summary["state"]["hash"], plain.json()["state"]["hash"]);
+        // One line when it stops, one when it continues.
+        let lines = done.stderr.lines().filter(|line| line.contains(role)).count();
+        assert_eq!(lines, 2, "{}", done.stderr);
     }
     bench.assert_clean(&[]);
 }
 
 #[test]
-fn in_real_time_a_stop_is_the_cause() {
+fn in_real_time_a_stopped_role_is_replaced_and_the_stop_is_named() {
     let bench = Bench::new();
     let options = ["--clock", "realtime", "--duration", "600", "--tick-hz", "100", "--json"];
     let relaxed = ["--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=0.5"];
     let run = bench.start(&[&["run", "rigid-pair"], &options[..], &relaxed].concat());
     let pid = bench.await_ticks("controller");
     send_signal(pid, STOP);
-    await_some(|| bench.role("controller").filter(|other| *other != pid));
+    await_some(|| bench.role("controller").filter(|successor| *successor != pid));
     run.signal(SIGINT);
     let done = run.wait();
-    let told = done.json();
-    let cause = told["incidents"][0]["cause"].as_str().unwrap_or_default();
-    assert!(done.code == Some(130) && cause.contains("stopped by a signal"), "{done:?}");
+    let summary = done.json();
+    let cause = summary["incidents"][0]["cause"].as_str().unwrap_or_default();
+    assert!(done.code == Some(130) && cause.contains("stopped"), "{done:?}");
     bench.assert_clean(&[]);
 }
 
@@ -80,7 +81,7 @@ fn ctrl_c_ends_a_run_with_a_stopped_role_in_order() {
     bench.assert_clean(&[]);
 }
 
-/// gdb on a process; ended with the test.
+/// gdb attached to a process; killed at the end of the test.
 struct Gdb(Child);
 
 impl Gdb {
@@ -100,19 +101,19 @@ impl Drop for Gdb {
     }
 }
 
-/// True if a process stands at a debugger's stop.
-fn held(pid: u32) -> bool {
+/// Returns true if a debugger has stopped a process.
+fn in_debugger(pid: u32) -> bool {
     common::status_of(pid, "State").starts_with('t')
 }
 
 #[test]
-fn a_role_is_debugged_from_before_the_first_tick() {
+fn with_debug_a_role_waits_for_a_debugger_before_the_first_tick() {
     let bench = Bench::new();
     let run = bench.start(&[&LOCKSTEP[..], &["--debug", "controller"]].concat());
     let pid = bench.await_role("controller");
     std::thread::sleep(STOPPED);
-    assert_eq!(bench.commits("controller"), 0, "no tick runs before a debugger is there");
-    // Attached, stopped for longer than silence may last, let go on.
+    assert_eq!(bench.commits("controller"), 0, "no tick runs before a debugger is attached");
+    // Stopped for longer than the heartbeat timeout, then continued.
     let gdb = Gdb::attach(&bench, pid, &["shell sleep 1.5", "continue"]);
     let done = run.wait();
     undisturbed(&done, 0);
@@ -122,32 +123,32 @@ fn a_role_is_debugged_from_before_the_first_tick() {
 }
 
 #[test]
-fn a_role_that_a_debugger_holds_is_waited_for_and_ctrl_c_ends_the_run() {
+fn lockstep_waits_for_a_debugged_role_and_ctrl_c_ends_the_run() {
     let bench = Bench::new();
     let run = bench.start(&LOCKSTEP);
     let pid = bench.await_ticks("controller");
     let gdb = Gdb::attach(&bench, pid, &[]);
-    await_some(|| held(pid).then_some(()));
+    await_some(|| in_debugger(pid).then_some(()));
     std::thread::sleep(STOPPED);
     assert_eq!(bench.role("controller"), Some(pid), "it is not killed");
     run.signal(SIGINT);
     let done = run.wait();
     undisturbed(&done, 130);
-    assert!(done.stderr.contains("stopped by a debugger"), "{}", done.stderr);
+    assert!(done.stderr.contains("debugger"), "{}", done.stderr);
     drop(gdb);
     bench.assert_clean(&[]);
 }
 
 #[test]
-fn what_cannot_be_debugged_is_refused() {
+fn an_invalid_debug_option_is_refused() {
     let bench = Bench::new();
-    for line in [
-        &["--clock", "lockstep", "--debug", "controler"][..],
-        &["--clock", "in-process", "--debug", "controller"],
-        &["--clock", "lockstep", "--external", "observer", "--debug", "observer,controller"],
-        &["--clock", "lockstep", "--set", "launch.debug=[\"lead\"]"],
+    for (line, code) in [
+        (&["--clock", "lockstep", "--debug", "controler"][..], "unknown-role"),
+        (&["--clock", "in-process", "--debug", "controller"], "one-process"),
+        (&["--clock", "lockstep", "--external", "observer", "--debug", "observer,controller"], "debugged-and-external"),
+        (&["--clock", "lockstep", "--set", "launch.debug=[\"lead\"]"], "unknown-role"),
     ] {
         let refused = bench.run(&[&["run", "rigid-pair"], line].concat());
-        assert!(refused.code == Some(2) && refused.stderr.contains("debug"), "{line:?}: {refused:?}");
+        assert!(refused.code == Some(2) && refused.says(code), "{line:?}: {refused:?}");
     }
 }

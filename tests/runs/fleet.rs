@@ -1,5 +1,5 @@
-//! Fleets: many followers in one process. Each gets the bits that it gets alone, under every clock; what happens to a
-//! follower happens to all of a fleet at once.
+//! Fleets: many followers in one process. Each body moves as it does alone, under every clock; a fault affects the whole
+//! fleet at once.
 
 use crate::common::{ANY_TICKS, Bench, await_some, send_signal, shipped};
 use corotate::bus::memory::MemoryBus;
@@ -11,10 +11,10 @@ use corotate::scenario::build;
 use libc::SIGKILL;
 use serde_json::Value;
 
-/// Rate and applied acceleration of one body, tick by tick.
+/// Rate and applied acceleration of one body at each tick.
 type Motion = Vec<([f64; 3], [f64; 3])>;
 
-/// Runs a scenario in this thread and looks at every truth of its follower.
+/// Runs a scenario in this thread and passes every true state of its follower to `look`.
 fn watch<S: Carried + ?Sized>(name: &str, overrides: &[String], bodies: usize, mut look: impl FnMut(&S)) {
     let common =
         ["accept={}", "limits={rate_rad_s=10.0, acceleration_rad_s2=3.0}", "duration_s=2.0", "clock=in-process"];
@@ -57,8 +57,7 @@ fn fleet(count: usize, overrides: &[String]) -> Vec<Motion> {
     motions
 }
 
-/// One body, or every tenth of many; with and without a prediction; at a tick that takes one step of the integration and at
-/// one that takes several; and with an actuator that is at its limit for a while.
+/// Every tenth body is compared, at one and at several integration steps per tick, also while an actuator saturates.
 #[test]
 fn every_body_of_a_fleet_moves_bit_by_bit_as_it_does_alone() {
     for (count, predict, tick_hz) in
@@ -86,7 +85,6 @@ fn hash(bench: &Bench, clock: &str, sets: &[&str]) -> (Value, Value) {
     (summary["state"]["hash"].clone(), summary)
 }
 
-/// Whatever is scripted to go wrong: the same bits in one thread and as processes, for the whole fleet at once.
 #[test]
 fn faults_of_a_fleet_are_the_same_in_one_thread_and_in_lockstep() {
     for (fault, rejected, safe) in [
@@ -104,18 +102,17 @@ fn faults_of_a_fleet_are_the_same_in_one_thread_and_in_lockstep() {
     ] {
         let bench = Bench::new();
         let sets = [&format!("fault=[{fault}]"), "duration_s=0.6", "follower.0.count=77"];
-        let ((one, summary), (many, _)) = (hash(&bench, "in-process", &sets), hash(&bench, "lockstep", &sets));
-        assert_eq!(one, many, "{fault}");
-        let of = |role: &str, key: &str| summary["books"]["roles"][role][key].as_u64().unwrap();
-        assert_eq!(of("fleet", "safe"), safe, "{fault}: {summary:#}");
+        let ((in_process, summary), (lockstep, _)) =
+            (hash(&bench, "in-process", &sets), hash(&bench, "lockstep", &sets));
+        assert_eq!(in_process, lockstep, "{fault}");
+        assert_eq!(summary["books"]["roles"]["fleet"]["safe"], safe, "{fault}: {summary:#}");
         let all = summary["books"]["rejected_samples"].as_u64().unwrap();
         assert!(if rejected > 0 { all == rejected } else { true }, "{fault}: {all} rejected");
     }
 }
 
-/// The kill of a fleet's process costs no bit in lockstep: its successor goes on with the bodies where they are.
 #[test]
-fn a_fleet_that_is_killed_goes_on_where_it_was() {
+fn in_lockstep_a_killed_fleet_continues_without_a_changed_bit() {
     let bench = Bench::new();
     let sets = ["duration_s=0.6", "follower.0.count=333", "controller.predict=true"];
     let whole = hash(&bench, "lockstep", &sets).0;
@@ -126,7 +123,7 @@ fn a_fleet_that_is_killed_goes_on_where_it_was() {
 }
 
 #[test]
-fn a_fleet_that_is_killed_from_outside_comes_back_and_settles() {
+fn in_real_time_a_killed_fleet_is_restarted_and_settles() {
     let bench = Bench::new();
     let file = shipped("rigid-fleet");
     let limits = format!("accept={{settled_by_s=5.0, sync_error_rad_s_max=1e-3, {ANY_TICKS}}}");
@@ -143,9 +140,9 @@ fn a_fleet_that_is_killed_from_outside_comes_back_and_settles() {
     bench.assert_clean(&domains);
 }
 
-/// Started by hand, which a device cannot be, it gives the bits of one that the launcher starts; its seat tells of slices.
+/// The seat describes the fleet's signals as slices.
 #[test]
-fn a_fleet_may_be_started_by_hand_and_is_no_device() {
+fn a_fleet_can_be_an_external_role_but_not_a_device() {
     let bench = Bench::new();
     let short = ["duration_s=0.4", "follower.0.count=50"];
     let whole = hash(&bench, "in-process", &short).0;
@@ -158,45 +155,48 @@ fn a_fleet_may_be_started_by_hand_and_is_no_device() {
         let seat = bench.domains().first()?.join("fleet.seat.json");
         seat.is_file().then_some(seat)
     });
-    let told: Value = serde_json::from_slice(&std::fs::read(&seat).unwrap()).unwrap();
-    assert_eq!((&told["writes"][1]["slice"], &told["writes"][1]["size"]), (&true.into(), &(8 * (6 + 6 * 50)).into()));
-    assert_eq!((&told["health"]["slice"], &told["reads"][0]["slice"]), (&false.into(), &true.into()));
+    let described: Value = serde_json::from_slice(&std::fs::read(&seat).unwrap()).unwrap();
+    let truth = &described["writes"][1];
+    assert_eq!((&truth["slice"], &truth["size"]), (&true.into(), &(8 * (6 + 6 * 50)).into()));
+    assert_eq!((&described["health"]["slice"], &described["reads"][0]["slice"]), (&false.into(), &true.into()));
     let domain = seat.parent().unwrap().to_str().unwrap();
     let refused = bench.run(&["bridge", "--serial", "/dev/null", "--role", "fleet", "--domain", domain]);
     assert!(refused.code == Some(2) && refused.says("no-device-role"), "{refused:?}");
     bench.run(&["plant", "--body", "fleet", "--domain", domain]).succeeded();
     let done = running.wait();
-    assert!(done.stderr.contains("corotate plant --body fleet") && !done.stderr.contains("bridge"), "{done:?}");
+    assert!(done.stderr.contains("--body fleet") && !done.stderr.contains("bridge"), "{done:?}");
     let summary = done.json();
     assert_eq!(summary["state"]["hash"], whole, "{summary:#}");
 }
 
 #[test]
-fn a_hundred_thousand_bodies_are_a_fleet_like_any_other() {
+fn a_fleet_of_a_hundred_thousand_bodies_runs() {
     let bench = Bench::new();
     let (_, summary) = hash(&bench, "in-process", &["follower.0.count=100000", "duration_s=0.1"]);
     assert_eq!(summary["books"]["missed_ticks"], 0);
     assert_eq!(summary["score"]["scored_ticks"], 51);
 }
 
-/// A fleet beside single followers, in any order: the books find their links.
 #[test]
-fn a_fleet_flies_beside_single_followers() {
+fn fleets_and_single_followers_can_be_mixed() {
     let bench = Bench::new();
     let single = |name: &str| format!("{{name=\"{name}\", initial_rate_rad_s=[0.1, 0.2, 0.3]}}");
     let fleet =
         |name: &str, count: usize| format!("{{name=\"{name}\", count={count}, initial_rate_rad_s=[0.1, 0.2, 0.3]}}");
     let followers = [fleet("f", 5), single("a"), fleet("g", 9), single("b")].join(", ");
     let sets = [&format!("follower=[{followers}]"), "duration_s=0.4"];
-    let ((one, summary), (many, _)) = (hash(&bench, "in-process", &sets), hash(&bench, "lockstep", &sets));
-    assert_eq!(one, many);
+    let ((in_process, summary), (lockstep, _)) = (hash(&bench, "in-process", &sets), hash(&bench, "lockstep", &sets));
+    assert_eq!(in_process, lockstep);
     assert_eq!(summary["books"]["missed_ticks"], 0);
-    assert!(summary["score"]["certificate"]["held"].as_u64().unwrap() > 100, "of the single ones: {summary:#}");
+    assert!(
+        summary["score"]["certificate"]["held"].as_u64().unwrap() > 100,
+        "certificates of single followers: {summary:#}"
+    );
 }
 
-/// The samples of one signal that wait for one reader, over all bodies, do not grow with the bodies.
+/// This bounds the number of samples that wait for one reader.
 #[test]
-fn many_bodies_run_less_far_ahead_in_lockstep() {
+fn with_more_bodies_lockstep_runs_fewer_ticks_ahead() {
     for (followers, window) in [(1, 64), (7, 64), (40, 12), (100, 5)] {
         let follower = |index| format!("{{name='f{index}', initial_rate_rad_s=[0.1,0.2,0.3]}}");
         let list: Vec<String> = (0..followers).map(follower).collect();
@@ -206,29 +206,25 @@ fn many_bodies_run_less_far_ahead_in_lockstep() {
 }
 
 #[test]
-fn what_no_fleet_can_be_is_refused_with_its_reason() {
-    for (set, said) in [
-        ("follower.0.count=0", "one process cannot host 0 bodies; give 1 to 1000000"),
-        ("follower.0.count=-1", "one process cannot host -1 bodies"),
-        ("follower.0.count=1000000000", "one process cannot host 1000000000 bodies"),
-        ("follower.0.count=2.5", "give a whole number"),
-        ("follower.0.initial_rate_spread_rad_s=[0.1, -0.1, 0.1]", "[negative]"),
-        ("follower.0.initial_rate_spread_rad_s=[4000.0, 0.0, 0.0]", "it turns too far from one tick"),
-        ("follower.0.noise_rad_s=[1e-3, 0.0, 0.0]", "is not supported for a fleet"),
-        ("follower.0.bias_rad_s=[1e-3, 0.0, 0.0]", "is not supported for a fleet"),
-        ("follower.0.inertia_factor=[1.0, 1.1, 1.0]", "is not supported for a fleet"),
-        ("controller.adaptation_gain=1.0", "adapts to the inertia of single followers"),
-        ("limits.repeats=10", "is not supported for a fleet"),
-        ("watchdog.lyapunov_rad2_s2_max=1.0", "is not published for a fleet"),
-        (
-            "follower=[{name=\"a\", initial_rate_rad_s=[0,0,0], initial_rate_spread_rad_s=[1,1,1]}]",
-            "give count, or remove it",
-        ),
-        ("fault=[{kind=\"lost-axis\", role=\"fleet\", from_tick=1, component=1}]", "this signal is neither"),
-        ("fault=[{kind=\"infinite\", role=\"fleet\", from_tick=1, component=3001}]", "give 1 to 3000"),
+fn an_invalid_fleet_is_refused() {
+    for (set, code) in [
+        ("follower.0.count=0", "out-of-range"),
+        ("follower.0.count=-1", "out-of-range"),
+        ("follower.0.count=1000000000", "out-of-range"),
+        ("follower.0.count=2.5", "wrong-type"),
+        ("follower.0.initial_rate_spread_rad_s=[0.1, -0.1, 0.1]", "negative"),
+        ("follower.0.initial_rate_spread_rad_s=[4000.0, 0.0, 0.0]", "turns-too-far"),
+        ("follower.0.noise_rad_s=[1e-3, 0.0, 0.0]", "fleet-key"),
+        ("follower.0.bias_rad_s=[1e-3, 0.0, 0.0]", "fleet-key"),
+        ("follower.0.inertia_factor=[1.0, 1.1, 1.0]", "fleet-key"),
+        ("controller.adaptation_gain=1.0", "fleet-key"),
+        ("limits.repeats=10", "fleet-key"),
+        ("watchdog.lyapunov_rad2_s2_max=1.0", "unused-key"),
+        ("follower=[{name=\"a\", initial_rate_rad_s=[0,0,0], initial_rate_spread_rad_s=[1,1,1]}]", "unused-key"),
+        ("fault=[{kind=\"lost-axis\", role=\"fleet\", from_tick=1, component=1}]", "wrong-signal"),
+        ("fault=[{kind=\"infinite\", role=\"fleet\", from_tick=1, component=3001}]", "no-such-component"),
     ] {
         let done = Bench::new().run(&["check", shipped("rigid-fleet").to_str().unwrap(), "--set", set]);
-        assert_eq!(done.code, Some(2), "{set}: {done:?}");
-        assert!(done.stderr.contains(said), "{set}: {}", done.stderr);
+        assert!(done.code == Some(2) && done.says(code), "{set}: {done:?}");
     }
 }

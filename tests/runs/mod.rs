@@ -1,4 +1,4 @@
-//! Runs whole loops under every clock, in one process or several, with devices and on several hosts, and checks how they end.
+//! Whole loops: under every clock, in one or several processes, with devices, on several hosts.
 
 mod actuation_delay;
 mod allocations;

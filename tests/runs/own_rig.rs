@@ -1,4 +1,4 @@
-//! A program of somebody else's, `examples/motor-pair`: with a rig that this crate does not know, everything works.
+//! A user's program with its own rig, `examples/motor-pair`: every command works with a rig that this crate does not know.
 
 use crate::common::{self, Bench, Running, await_some, python, root};
 use libc::SIGKILL;
@@ -9,7 +9,7 @@ use std::sync::OnceLock;
 
 const TICKS: u64 = 10_001;
 
-/// The program, built from outside as its author would, but into the same place, where its dependencies are built already.
+/// Builds the program as its author would, but in the same target directory, which has its dependencies.
 fn program() -> &'static Path {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
     PROGRAM.get_or_init(|| {
@@ -25,8 +25,8 @@ fn program() -> &'static Path {
     })
 }
 
-/// Hash and number of the ticks before the first that was missed.
-fn clean(bench: &Bench, out: &str) -> (Vec<String>, usize) {
+/// Returns the printed hashes, and the number of ticks before the first missed one.
+fn hashes(bench: &Bench, out: &str) -> (Vec<String>, usize) {
     let text = std::fs::read_to_string(bench.path(out).join("hashes.txt")).unwrap();
     let clean = bench.summary_in(out)["state"]["clean_ticks"].as_u64().unwrap();
     let hashes = text.lines().filter(|line| !line.starts_with('#')).map(str::to_owned);
@@ -34,38 +34,38 @@ fn clean(bench: &Bench, out: &str) -> (Vec<String>, usize) {
 }
 
 #[test]
-fn three_clocks_give_one_hash() {
-    let bench = Bench::of(program());
+fn all_clocks_give_the_same_hash() {
+    let bench = Bench::with_program(program());
     for clock in ["in-process", "lockstep", "realtime"] {
-        // A loaded machine may miss ticks in real time, and with them the criteria.
+        // A loaded machine may miss ticks in real time, so there the criteria are removed.
         let relaxed = if clock == "realtime" { "accept={}" } else { "seed=1" };
         let done = bench.run(&["run", "--clock", clock, "--out", clock, "--set", relaxed]);
         assert_eq!(done.code, Some(0), "{clock}: {done:?}");
         assert_eq!(bench.summary_in(clock)["state"]["elapsed_ticks"], TICKS, "{clock}");
         assert_eq!(bench.summary_in(clock)["books"]["balanced"], true, "{clock}");
     }
-    let (one, clean_one) = clean(&bench, "in-process");
-    assert_eq!(clean_one as u64, TICKS);
-    assert_eq!(clean(&bench, "lockstep"), (one.clone(), clean_one));
-    let (live, clean_live) = clean(&bench, "realtime");
-    let common = one.iter().zip(&live).take_while(|(one, live)| one == live).count();
+    let (expected, clean_ticks) = hashes(&bench, "in-process");
+    assert_eq!(clean_ticks as u64, TICKS);
+    assert_eq!(hashes(&bench, "lockstep"), (expected.clone(), clean_ticks));
+    let (live, clean_live) = hashes(&bench, "realtime");
+    let common = expected.iter().zip(&live).take_while(|(expected, live)| expected == live).count();
     assert!(common >= clean_live.min(live.len()), "{common} hashes are the same, {clean_live} ticks were clean");
 }
 
 #[test]
-fn what_a_scenario_gets_wrong_is_told_as_for_any_rig() {
-    let bench = Bench::of(program());
+fn errors_in_a_scenario_are_located_as_for_shipped_rigs() {
+    let bench = Bench::with_program(program());
     let shipped = bench.run(&["init", "motor-pair"]).succeeded();
     let listed = bench.run(&["init", "--list"]).stdout;
     assert!(listed.starts_with("motor-pair  Two DC motors.") && listed.lines().count() == 1, "{listed}");
     let by_name = bench.run(&["check", "motor-pair"]);
-    assert!(by_name.code == Some(0) && by_name.stdout.starts_with("motor-pair: valid\n"), "{by_name:?}");
+    assert!(by_name.code == Some(0) && by_name.stdout.starts_with("motor-pair: "), "{by_name:?}");
     let schema: Value = serde_json::from_str(&bench.run(&["schema"]).stdout).unwrap();
     assert_eq!(schema["properties"]["rig"]["enum"], serde_json::json!(["motor-pair"]));
     assert_eq!(schema["properties"]["motor"]["properties"]["inertia_kg_m2"]["type"], "number");
     let line = |key: &str| 1 + shipped.stdout.lines().position(|line| line.starts_with(key)).unwrap();
     for (from, to, expected) in [
-        ("inertia_kg_m2 = 1e-3", "inertia_kg_m2 = -1", "motor.inertia_kg_m2: -1 is not above zero"),
+        ("inertia_kg_m2 = 1e-3", "inertia_kg_m2 = -1", "[not-positive]"),
         ("inertia_kg_m2 = 1e-3", "inertia_kg_m2 = \"a\"", "motor.inertia_kg_m2: "),
         ("gain_per_s", "gian_per_s", "gain_per_s"),
         ("speed_error_rad_s_max", "sped_error_rad_s_max", "speed_error_rad_s_max"),
@@ -83,10 +83,9 @@ fn what_a_scenario_gets_wrong_is_told_as_for_any_rig() {
     assert!(refused.code == Some(2) && refused.stderr.contains("motor-pair"), "{refused:?}");
 }
 
-/// Recorded, replayed, compared, exported, drawn: with its faults, and judged.
 #[test]
-fn a_run_is_recorded_replayed_compared_exported_and_drawn() {
-    let bench = Bench::of(program());
+fn record_replay_diff_export_and_report_work() {
+    let bench = Bench::with_program(program());
     let fault = "fault=[{kind=\"not-a-number\",role=\"leader\",field=\"speed_rad_s\",from_tick=100,ticks=5},\
                  {kind=\"drop\",role=\"controller\",from_tick=300,ticks=30},{kind=\"kill\",role=\"observer\",from_tick=500}]";
     let run = |out: &str, clock: &str, fault: &str| {
@@ -96,15 +95,15 @@ fn a_run_is_recorded_replayed_compared_exported_and_drawn() {
         assert!(std::fs::read_to_string(bench.path(&junit)).unwrap().contains("load_error_n_m"));
         bench.path(out).join("run.mcap").display().to_string()
     };
-    let (one, other) = (run("one", "in-process", fault), run("other", "lockstep", fault));
+    let (in_process, lockstep) = (run("one", "in-process", fault), run("other", "lockstep", fault));
     let quiet = run("quiet", "in-process", "fault=[]");
-    let told = bench.summary_in("one");
-    assert_eq!(told["books"]["rejected_samples"], 5, "{:#}", told["books"]);
-    assert!(told["score"]["statuses"].to_string().contains("holding"), "{:#}", told["score"]["statuses"]);
-    assert_eq!(bench.run(&["replay", &one]).code, Some(0));
-    assert_eq!(bench.run(&["replay", &other, "--role", "controller"]).code, Some(0));
-    assert_eq!(bench.run(&["diff", &one, &other]).code, Some(0));
-    let differs = bench.run(&["diff", &one, &quiet]);
+    let summary = bench.summary_in("one");
+    assert_eq!(summary["books"]["rejected_samples"], 5, "{:#}", summary["books"]);
+    assert!(summary["score"]["statuses"].to_string().contains("holding"), "{:#}", summary["score"]["statuses"]);
+    assert_eq!(bench.run(&["replay", &in_process]).code, Some(0));
+    assert_eq!(bench.run(&["replay", &lockstep, "--role", "controller"]).code, Some(0));
+    assert_eq!(bench.run(&["diff", &in_process, &lockstep]).code, Some(0));
+    let differs = bench.run(&["diff", &in_process, &quiet]);
     assert!(differs.code == Some(3) && differs.stdout.contains("speed_rad_s"), "{differs:?}");
     bench.run(&["export", &quiet, "--csv", "tables"]).succeeded();
     let tables = std::fs::read_dir(bench.path("tables")).unwrap().map(|entry| entry.unwrap().path());
@@ -115,22 +114,22 @@ fn a_run_is_recorded_replayed_compared_exported_and_drawn() {
     for drawn in ["speed, rad/s", "load, N m", "current, A", "speed_error_rad_s"] {
         assert!(html.contains(drawn), "{drawn}");
     }
-    // Errors of different units have pictures of their own, and nothing is drawn that other rigs asked for.
+    // One chart for each unit of an error, and no charts that only other rigs request.
     for (drawn, count) in
         [(">error, rad/s<", 1), (">error, N m<", 1), ("error, in the unit", 0), ("logarithm of time", 0)]
     {
-        // As wide as the page, and as narrow as a phone.
+        // Each chart has a wide and a narrow version.
         assert_eq!(html.matches(drawn).count(), 2 * count, "{drawn}");
     }
 }
 
-/// A role is killed and started anew, watched and seen in its seat; the same bits.
+/// The hashes are those of a run without a kill.
 #[test]
-fn a_killed_role_is_started_anew_and_the_run_is_watched() {
-    let bench = Bench::of(program());
+fn a_run_can_be_watched_and_a_killed_role_is_restarted() {
+    let bench = Bench::with_program(program());
     bench.run(&["run", "--clock", "in-process", "--duration", "1000", "--out", "whole"]).succeeded();
     let running = bench.start(&["run", "--clock", "lockstep", "--duration", "1000", "--out", "killed"]);
-    // The tick that the screen shows, once there is one.
+    // Wait until the screen shows a tick.
     let screen = await_some(|| {
         let screen = bench.run(&["watch", "--once", "1"]);
         let tick =
@@ -141,13 +140,13 @@ fn a_killed_role_is_started_anew_and_the_run_is_watched() {
     running.wait().succeeded();
     assert!(screen.code == Some(0) && screen.stdout.contains("speed_error_rad_s"), "{screen:?}");
     assert!(!bench.summary_in("killed")["incidents"].as_array().unwrap().is_empty());
-    assert_eq!(clean(&bench, "killed"), clean(&bench, "whole"));
+    assert_eq!(hashes(&bench, "killed"), hashes(&bench, "whole"));
 }
 
-/// A program in Python that knows of the rig only what its seat says.
+/// The Python program reads everything about the rig from the seat file.
 #[test]
-fn the_seat_of_a_motor_is_taken_by_a_program_in_python() {
-    let bench = Bench::of(program());
+fn a_python_program_takes_the_role_of_a_motor() {
+    let bench = Bench::with_program(program());
     let described = bench.run(&["seat", "motor-pair.toml", "follower"]);
     assert_eq!(described.code, Some(2), "there is no such file here: {described:?}");
     let running = bench.start(&["run", "--clock", "lockstep", "--external", "follower", "--out", "out", "--json"]);
@@ -158,10 +157,10 @@ fn the_seat_of_a_motor_is_taken_by_a_program_in_python() {
     assert_eq!(bench.summary_in("out")["books"]["balanced"], true);
 }
 
-/// The rows that need a run are of the program's own scenario, and say what they do not judge.
+/// The targets hold for corotate's own scenario only.
 #[test]
-fn its_own_loop_is_measured() {
-    let bench = Bench::of(program());
+fn bench_measures_the_own_scenario_without_targets() {
+    let bench = Bench::with_program(program());
     let done = bench
         .run(&["bench", "chain", "tick", "lockstep", "overhead", "--quick", "--json", "--out", "results"])
         .succeeded();
@@ -186,14 +185,13 @@ fn its_own_loop_is_measured() {
         assert!(found.is_some_and(|figure| figure["median"].as_f64().unwrap() >= 0.0), "{row}: {name}: {done:?}");
     }
     assert!(results["targets"].as_array().unwrap().is_empty(), "{done:?}");
-    assert!(done.stderr.contains("the targets are those of corotate's scenario rigid-pair"), "{done:?}");
+    assert!(done.stderr.contains("rigid-pair"), "{done:?}");
     let checked = bench.run(&["bench", "chain", "--check"]);
     assert!(checked.code == Some(2) && checked.stderr.contains("nothing to judge"), "{checked:?}");
 }
 
-/// What `corotate new` writes is this example under another name.
 #[test]
-fn a_new_crate_is_the_example_under_its_name() {
+fn corotate_new_writes_this_example_under_another_name() {
     let bench = Bench::new();
     bench.run(&["new", "two-motors"]).succeeded();
     for (file, original) in
@@ -205,14 +203,14 @@ fn a_new_crate_is_the_example_under_its_name() {
     }
     let manifest = std::fs::read_to_string(bench.path("two-motors/Cargo.toml")).unwrap();
     assert!(manifest.contains("name = \"two-motors\"") && manifest.contains("corotate = {"), "{manifest}");
-    assert_eq!(bench.run(&["new", "two-motors"]).code, Some(2), "it is there already");
+    assert_eq!(bench.run(&["new", "two-motors"]).code, Some(2), "it exists already");
     for name in ["Two", "1st", "a_b", "corotate", "x", "../x", "a-"] {
         let refused = bench.run(&["new", name]);
-        assert!(refused.code == Some(2) && refused.stderr.contains("cannot name"), "{name}: {refused:?}");
+        assert!(refused.code == Some(2) && refused.says("bad-name"), "{name}: {refused:?}");
     }
 }
 
-/// The example with a law that panics at tick 500 as `PANIC` says, under another name.
+/// Builds a copy of the example whose law panics at tick 500 in the way that the variable `PANIC` selects.
 fn panicking() -> &'static Path {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
     PROGRAM.get_or_init(|| {
@@ -271,10 +269,10 @@ fn fail(tick: u64) {
 }
 "#;
 
-/// The message and the place are the user's, they come first, and the same panic does not come again and again.
+/// A panic that repeats at the same tick ends the run.
 #[test]
-fn a_law_that_panics_is_told_by_its_message_and_place() {
-    let bench = Bench::of(panicking());
+fn a_panic_of_a_law_is_reported_with_its_message_and_place() {
+    let bench = Bench::with_program(panicking());
     for (kind, message, starts) in [
         ("lines", "the rate is NaN\n  at tick 500", 2),
         ("long", "the rate is NaNé", 2),
@@ -292,9 +290,9 @@ fn a_law_that_panics_is_told_by_its_message_and_place() {
             }
             let out = format!("{kind}-{clock}");
             if clock == "in-process" && kind == "nested" {
-                // The panic in a panic ends the only process there is; its message comes first all the same.
+                // A panic during a panic ends the only process; the first message is printed nevertheless.
                 let done = run(&["run", "--clock", clock, "--out", &out], "0");
-                assert!(done.stderr.contains("panicked at src/main.rs:") && done.stderr.contains(message), "{done:?}");
+                assert!(done.stderr.contains("src/main.rs:") && done.stderr.contains(message), "{done:?}");
                 continue;
             }
             let line =
@@ -304,8 +302,8 @@ fn a_law_that_panics_is_told_by_its_message_and_place() {
             assert!(!done.stderr.contains("defect"), "{out}: {done:?}");
             let first = done.stderr.lines().find(|line| line.contains("panicked at")).unwrap();
             assert!(first.contains("src/main.rs:"), "{out}: {done:?}");
-            let told = bench.summary_in(&out);
-            let incidents = told["incidents"].as_array().unwrap();
+            let summary = bench.summary_in(&out);
+            let incidents = summary["incidents"].as_array().unwrap();
             assert_eq!(incidents.len(), starts, "{out}: {incidents:#?}");
             for (index, incident) in incidents.iter().enumerate() {
                 assert_eq!(incident["role"], "controller", "{out}");
@@ -320,7 +318,7 @@ fn a_law_that_panics_is_told_by_its_message_and_place() {
                 assert_eq!(incident["action"] == "stopped", index + 1 == starts, "{out}: {incident}");
                 assert!(clock == "realtime" || incident["tick"] == 500, "{out}: {incident}");
             }
-            assert_eq!(told["books"]["balanced"], true, "{out}");
+            assert_eq!(summary["books"]["balanced"], true, "{out}");
         }
     }
     bench.assert_clean(&[]);

@@ -1,5 +1,5 @@
-//! A run as processes, from outside: signals, killed roles, a killed launcher, two runs at once, roles started by hand.
-//! After each of them nothing may be left: no process, no file.
+//! Runs in several processes: signals, killed roles and launchers, runs side by side, external roles, privileges.
+//! After each run no process and no file may be left.
 
 use crate::common::{Bench, Running, await_some, send_signal, shipped, skipped};
 use libc::{SIGINT, SIGKILL, SIGSTOP, SIGTERM};
@@ -46,14 +46,13 @@ fn an_in_process_run_ends_in_order_too() {
 }
 
 #[test]
-fn a_killed_role_ends_the_run_by_name_and_cause() {
+fn with_on_failure_stop_a_killed_role_ends_the_run() {
     for role in ["leader", "follower", "observer", "controller"] {
         let bench = Bench::new();
         let (running, domains) = start_endless(&bench, &["--set", "supervision.on_failure=\"stop\""]);
         send_signal(bench.await_role(role), SIGKILL);
         let done = running.wait();
         assert_eq!(done.code, Some(4), "{done:?}");
-        assert!(done.stderr.contains(&format!("{role} died at tick ")), "{done:?}");
         assert!(done.says("killed"), "{done:?}");
         let summary = bench.summary_in("out");
         assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
@@ -63,7 +62,7 @@ fn a_killed_role_ends_the_run_by_name_and_cause() {
 }
 
 #[test]
-fn a_killed_launcher_takes_everything_with_it() {
+fn nothing_outlives_a_killed_launcher() {
     for clock in ["realtime", "lockstep"] {
         let bench = Bench::new();
         let (running, domains) = start_endless(&bench, &["--clock", clock]);
@@ -73,24 +72,24 @@ fn a_killed_launcher_takes_everything_with_it() {
     }
 }
 
-/// Launcher and janitor both killed: the next run of the same user cleans up.
+/// Launcher and janitor are both killed.
 #[test]
-fn the_next_run_removes_what_a_killed_janitor_could_not() {
+fn the_next_run_of_the_user_removes_files_that_are_left() {
     let bench = Bench::new();
     let (running, domains) = start_endless(&bench, &[]);
     send_signal(bench.await_role("janitor"), SIGKILL);
     running.signal(SIGKILL);
     running.wait();
-    // The roles die by the kernel's hand at once.
+    // The kernel kills the roles at once.
     await_some(|| bench.processes().is_empty().then_some(()));
-    assert_eq!(bench.domains(), domains, "this test is about a domain that is left");
+    assert_eq!(bench.domains(), domains, "the domain is left");
     bench.summary("rigid-pair", &["--clock", "lockstep", "--duration", "0.1", "--set", "accept={}"]);
     bench.assert_clean(&domains);
 }
 
-/// A janitor that stands still is replaced when it is needed, and not waited for when it is not.
+/// It is replaced if a role dies, and otherwise ignored.
 #[test]
-fn a_janitor_that_stands_still_keeps_nobody() {
+fn a_stopped_janitor_delays_no_restart_and_no_end() {
     for clock in ["realtime", "lockstep"] {
         for kills in [true, false] {
             let bench = Bench::new();
@@ -114,7 +113,7 @@ fn a_janitor_that_stands_still_keeps_nobody() {
 }
 
 #[test]
-fn two_runs_at_once_do_not_meet() {
+fn simultaneous_runs_do_not_affect_each_other() {
     for clock in ["lockstep", "realtime"] {
         let bench = Bench::new();
         let file = shipped("rigid-pair");
@@ -129,7 +128,7 @@ fn two_runs_at_once_do_not_meet() {
         });
         assert_ne!(summaries[0]["domain"], summaries[1]["domain"]);
         assert!(summaries.iter().all(|summary| summary["books"]["balanced"] == true), "{clock}");
-        // In real time each may miss ticks of its own; up to there they are one.
+        // In real time each may miss different ticks.
         if clock == "lockstep" {
             assert_eq!(summaries[0]["state"]["hash"], summaries[1]["state"]["hash"]);
         }
@@ -137,20 +136,19 @@ fn two_runs_at_once_do_not_meet() {
     }
 }
 
-/// Two default runs in one directory get result directories of their own.
 #[test]
-fn runs_of_the_same_second_do_not_overwrite_each_other() {
+fn runs_of_the_same_second_get_different_results_directories() {
     let bench = Bench::new();
     let run = || bench.start(&["run", shipped("rigid-pair").to_str().unwrap(), "--clock", "in-process"]);
     for run in [run(), run(), run()] {
         assert_eq!(run.wait().code, Some(0));
     }
-    // And the link to the newest of them.
+    // And the link `latest`.
     assert_eq!(std::fs::read_dir(bench.path("runs")).unwrap().count(), 3 + 1);
 }
 
 #[test]
-fn a_role_can_be_started_by_hand() {
+fn an_external_role_can_be_started_by_hand() {
     let bench = Bench::new();
     let file = shipped("rigid-pair");
     let run =
@@ -161,22 +159,22 @@ fn a_role_can_be_started_by_hand() {
     let by_hand = bench.start(&["observer", "--domain", domain.to_str().unwrap()]);
     let (run, role) = (running.wait(), by_hand.wait());
     assert_eq!((run.code, role.code), (Some(0), Some(0)), "{run:?} {role:?}");
-    assert!(run.stderr.contains("corotate observer --domain"), "{run:?}");
+    assert!(run.stderr.contains("observer --domain"), "{run:?}");
     let summary = run.json();
     assert_eq!(summary["books"]["roles"]["observer"]["executed"], 10_001);
     assert_eq!(summary["state"]["hash"], bench.summary("rigid-pair", &["--clock", "in-process"])["state"]["hash"]);
     bench.assert_clean(&[domain]);
 }
 
-/// Every program that takes a seat in the midst of a run is told, by its process and the tick of its first sample.
+/// The incident has the process of the successor and the tick of its first sample.
 #[test]
-fn a_role_by_hand_that_is_replaced_is_told_each_time() {
+fn each_replacement_of_an_external_role_is_an_incident() {
     const LIVES: usize = 4;
     for clock in ["realtime", "lockstep"] {
         let bench = Bench::new();
         let file = shipped("rigid-pair");
         let endless = ["--tick-hz", "200", "--duration", "100000", "--out", "out", "--set", "accept={}"];
-        // A role may be away for long on a loaded machine.
+        // On a loaded machine a role may be missing for long.
         let patient = ["--set", "supervision.heartbeat_timeout_s=60", "--external", "follower", "--json"];
         let run = bench.start(&[&["run", file.to_str().unwrap(), "--clock", clock], &endless[..], &patient].concat());
         let domain = await_some(|| bench.domains().pop());
@@ -197,25 +195,26 @@ fn a_role_by_hand_that_is_replaced_is_told_each_time() {
         assert_eq!(run.code, Some(128 + SIGTERM), "{clock}: {run:?}");
         let summary = run.json();
         let incidents = summary["incidents"].as_array().unwrap();
-        let by: Vec<_> = incidents.iter().map(|one| one["replaced_by"]["pid"].as_u64().unwrap()).collect();
+        let by: Vec<_> = incidents.iter().map(|incident| incident["replaced_by"]["pid"].as_u64().unwrap()).collect();
         assert_eq!(by, pids[1..], "{clock}: {incidents:?}");
         for incident in incidents {
-            let [left, back] = [&incident["tick"], &incident["replaced_by"]["tick"]].map(|tick| tick.as_u64().unwrap());
+            let [died, replaced] =
+                [&incident["tick"], &incident["replaced_by"]["tick"]].map(|tick| tick.as_u64().unwrap());
             assert_eq!((&incident["role"], &incident["action"]), (&"follower".into(), &"continued".into()));
             let time_s = incident["time_s"].as_f64().unwrap();
-            assert!(left > 0 && back >= left && (time_s - left as f64 / 200.0).abs() < 1e-9, "{incident}");
+            assert!(died > 0 && replaced >= died && (time_s - died as f64 / 200.0).abs() < 1e-9, "{incident}");
             assert!(incident["outage_s"].as_f64().unwrap() > 0.0, "{incident}");
         }
         bench.assert_clean(&[domain]);
     }
 }
 
-/// A real-time priority is refused to an ordinary user without a limit that allows it.
+/// A priority that an ordinary user gets only if a resource limit allows it.
 const UNGRANTABLE: [&str; 2] = ["--set", "realtime.priority=99"];
 
-/// Nobody starts it, so nobody ends it: it notices by itself that nobody is left.
+/// It is not a child of the launcher and must notice its end by itself.
 #[test]
-fn a_role_by_hand_does_not_outlive_a_killed_launcher() {
+fn an_external_role_does_not_outlive_a_killed_launcher() {
     for clock in ["lockstep", "realtime"] {
         let bench = Bench::new();
         let file = shipped("rigid-pair");
@@ -232,15 +231,15 @@ fn a_role_by_hand_does_not_outlive_a_killed_launcher() {
     }
 }
 
-/// Whoever joins a run at its very end may have missed its last word.
+/// At the end of a run a joiner may miss the last message of the launcher.
 #[test]
-fn who_joins_a_run_that_ends_ends_too() {
+fn a_recorder_or_watcher_that_joins_at_the_end_does_not_hang() {
     let bench = Bench::new();
     let words = ["run", "rigid-pair", "--clock", "lockstep", "--duration", "20", "--set", "accept={}"];
     for attempt in 0..12 {
         let run = bench.start(&words);
         let domain = await_some(|| bench.domains().pop());
-        // Not to wait for anything: each attempt joins at another place of the run.
+        // A delay, not a wait: each attempt joins at another point of the run.
         std::thread::sleep(std::time::Duration::from_millis(30 * attempt));
         let domain = domain.to_str().unwrap();
         let record = bench.start(&["record", "--domain", domain, "--out", "part.mcap", "--overwrite"]);
@@ -255,7 +254,7 @@ fn who_joins_a_run_that_ends_ends_too() {
 }
 
 #[test]
-fn a_privilege_that_is_not_granted_is_told_and_only_fails_a_run_that_requires_it() {
+fn a_denied_privilege_is_reported_and_fails_only_a_run_that_requires_it() {
     let bench = Bench::unprivileged();
     let words = ["run", "rigid-pair", "--duration", "0.2", "--set", "accept={}", "--clock", "realtime", "--json"];
     let run = |more: &[&str]| bench.run(&[&words[..], &UNGRANTABLE, more].concat());
@@ -264,7 +263,7 @@ fn a_privilege_that_is_not_granted_is_told_and_only_fails_a_run_that_requires_it
     let denied = summary["privileges"].as_array().unwrap().iter().filter(|grant| grant["granted"] == false);
     let fifo = denied.clone().filter(|grant| grant["privilege"] == "SCHED_FIFO").count();
     if fifo == 0 {
-        return skipped("a privilege that is not granted", "this user has real-time priority 99");
+        return skipped("a denied privilege", "this user has real-time priority 99");
     }
     assert!(denied.clone().all(|grant| !grant["reason"].as_str().unwrap().is_empty()));
     let done = run(&["--require-rt"]);
@@ -273,7 +272,7 @@ fn a_privilege_that_is_not_granted_is_told_and_only_fails_a_run_that_requires_it
 }
 
 #[test]
-fn cores_that_are_not_there_are_refused_before_anything_starts() {
+fn a_missing_core_is_refused_before_the_run() {
     let bench = Bench::new();
     let cores = ["--set", "realtime.cores=[0,1023]"];
     for command in [&["run", "rigid-pair", "--out", "out"][..], &["check", "rigid-pair"]] {
@@ -286,7 +285,7 @@ fn cores_that_are_not_there_are_refused_before_anything_starts() {
 }
 
 #[test]
-fn a_criterion_that_does_not_hold_gives_exit_code_3_and_says_which() {
+fn an_unmet_criterion_gives_exit_code_3() {
     let bench = Bench::new();
     let file = shipped("rigid-pair");
     let set = ["--set", "accept.settled_by_s=0.5", "--set", "accept.sync_error_rad_s_max=1e-6"];
@@ -300,9 +299,9 @@ fn a_criterion_that_does_not_hold_gives_exit_code_3_and_says_which() {
     bench.assert_clean(&[]);
 }
 
-/// The job of the whole program: the hidden component is never published, and yet the bodies synchronise.
+/// The purpose of the program: one component of the leader's rate is neither measured nor published.
 #[test]
-fn the_follower_synchronises_in_real_time_with_a_component_that_nobody_measures() {
+fn in_real_time_the_follower_synchronises_with_an_unmeasured_component() {
     let bench = Bench::new();
     let summary = bench.summary("rigid-pair", &["--set", "accept={}", "--out", "out"]);
     assert_eq!(summary["clock"], "realtime");
@@ -312,7 +311,7 @@ fn the_follower_synchronises_in_real_time_with_a_component_that_nobody_measures(
     let missed = books["missed_ticks"].as_u64().unwrap();
     println!("{error:e} rad/s at the end, {missed} of 40004 ticks missed or starved");
     assert_eq!(books["balanced"], true, "{summary:#}");
-    // A machine that withholds the processor for much of the run gives a slower loop, and says so; never an unstable one.
+    // With many missed ticks the loop is slower, but never unstable.
     let limit = if missed < 2000 { 1e-9 } else { 1.0 };
     assert!(error < limit, "{error:e}: {summary:#}");
     let stages: Vec<(&str, &str)> = summary["latencies"]
@@ -340,10 +339,9 @@ fn the_follower_synchronises_in_real_time_with_a_component_that_nobody_measures(
     bench.assert_clean(&[]);
 }
 
-/// Every tick has an entry in every stage, also those that a controller which stands still for 20 ms misses, and those that a
-/// follower spends with an old command: nothing is omitted because a role was absent.
+/// This includes the ticks that a stalled controller misses, and those in which the follower uses an old command.
 #[test]
-fn every_stage_counts_every_tick() {
+fn latencies_include_every_tick_also_missed_ones() {
     let bench = Bench::new();
     let stall = "fault=[{kind=\"stall\", role=\"controller\", from_tick=300, stall_ms=20.0}]";
     let summary = bench.summary("rigid-pair", &["--duration", "1", "--set", "accept={}", "--set", stall]);
@@ -351,13 +349,13 @@ fn every_stage_counts_every_tick() {
     let find = |role: &str, stage: &str| {
         stages.iter().find(|found| found["role"] == role && found["stage"] == stage).unwrap().clone()
     };
-    for (role, told) in [
+    for (role, reported) in [
         ("leader", &["lateness", "step"][..]),
         ("follower", &["lateness", "step"]),
         ("observer", &["hop", "step", "age"]),
         ("controller", &["hop", "step", "age"]),
     ] {
-        told.iter().for_each(|stage| assert_eq!(find(role, stage)["count"], 1001, "{role} {stage}"));
+        reported.iter().for_each(|stage| assert_eq!(find(role, stage)["count"], 1001, "{role} {stage}"));
     }
     for (role, stage) in [("controller", "hop"), ("controller", "step"), ("controller", "age"), ("follower", "age")] {
         let found = find(role, stage);
@@ -367,9 +365,8 @@ fn every_stage_counts_every_tick() {
     }
 }
 
-/// The resolved scenario in the run directory is the run: it gives the same bits again.
 #[test]
-fn the_resolved_scenario_repeats_the_run() {
+fn the_resolved_scenario_of_a_run_gives_the_same_hash() {
     let bench = Bench::new();
     let first = bench.summary("rigid-trio", &["--clock", "lockstep", "--out", "first"]);
     let again = bench.path("first/scenario.toml");
@@ -378,9 +375,9 @@ fn the_resolved_scenario_repeats_the_run() {
     assert_eq!(first["state"]["hash"], again["state"]["hash"]);
 }
 
-/// The truth has one reader, the scorer: asked of the transport itself, while the loop runs.
+/// Asks the transport itself, during a run.
 #[test]
-fn the_truth_is_open_to_the_scorer_alone() {
+fn only_the_scorer_opens_the_truth() {
     use iceoryx2::prelude::*;
     let bench = Bench::new();
     let (running, domains) = start_endless(&bench, &["--clock", "realtime"]);
@@ -406,9 +403,9 @@ fn the_truth_is_open_to_the_scorer_alone() {
     bench.assert_clean(&domains);
 }
 
-/// Without any privilege (as nobody, where the test itself runs as root) everything works, and every refusal is told.
+/// Runs as the user `nobody` if the test runs as root.
 #[test]
-fn a_run_without_privileges_works_and_says_what_it_lacks() {
+fn a_run_without_privileges_works_and_reports_each_denial() {
     let bench = Bench::unprivileged();
     let summary = bench.summary("rigid-pair", &["--duration", "1", "--set", "accept={}", "--clock", "realtime"]);
     let fifo = summary["privileges"].as_array().unwrap().iter().filter(|grant| grant["privilege"] == "SCHED_FIFO");
@@ -416,15 +413,15 @@ fn a_run_without_privileges_works_and_says_what_it_lacks() {
     if rustix::process::getuid().is_root() {
         assert!(fifo.clone().all(|grant| grant["granted"] == false && grant["reason"] != ""), "{summary:#}");
     } else {
-        skipped("the refusal of SCHED_FIFO", "only root knows a user who has no privilege, nobody");
+        skipped("the denial of SCHED_FIFO", "only root can run as a user without privileges");
     }
     assert_eq!(summary["books"]["balanced"], true);
     bench.assert_clean(&[]);
 }
 
-/// Neither the observer nor the controller reads the truth: their books name every signal they read.
+/// The counters have an entry for every signal that a role reads.
 #[test]
-fn the_truth_is_read_by_nobody_in_the_loop() {
+fn no_role_of_the_loop_reads_the_truth() {
     let bench = Bench::new();
     let summary = bench.summary("rigid-trio", &["--clock", "lockstep", "--duration", "0.5", "--set", "accept={}"]);
     let links = summary["books"]["links"].as_array().unwrap();
