@@ -110,12 +110,12 @@ impl Done {
         self.codes().contains(&code)
     }
 
-    /// Returns the number of roles of `replay --json` whose samples were all compared and equal.
+    /// Returns the number of roles of `replay --json` without a difference, and the number of those compared to the end.
     #[track_caller]
-    pub fn roles_replayed(&self) -> usize {
+    pub fn roles_replayed(&self) -> (usize, usize) {
         let replay = self.json();
-        let roles = replay["roles"].as_array().unwrap().iter();
-        roles.filter(|role| role["same"] == true && role["limit"].is_null()).count()
+        let same = replay["roles"].as_array().unwrap().iter().filter(|role| role["same"] == true);
+        (same.clone().count(), same.filter(|role| role["limit"].is_null()).count())
     }
 
     /// Parses stdout as JSON.

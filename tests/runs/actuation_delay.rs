@@ -77,7 +77,7 @@ fn every_clock_and_replay_gives_the_same_hash_at_each_delay() {
                 [&["replay", "lockstep"][..], &["replay", "realtime"], &["replay", "--processes", "realtime"]]
             {
                 let done = bench.run(&[arguments, &["--json"]].concat());
-                assert_eq!((done.code, done.roles_replayed()), (Some(0), roles), "{sets:?}: {done:?}");
+                assert_eq!((done.code, done.roles_replayed()), (Some(0), (roles, roles)), "{sets:?}: {done:?}");
             }
             hashes.push(expected);
         }
