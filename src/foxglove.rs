@@ -1,9 +1,9 @@
-//! A run live on a Foxglove WebSocket, from a process of its own: the channels of a recording, made by its tables.
+//! Publishes a run on a Foxglove WebSocket from a separate process, with the channels of a recording.
 //!
-//! Messages are logged at the time when their tick was due, as `publish_time` is in a recording. Foxglove plots by that time,
-//! and the time of receipt would be when this process looked: in steps of `LOOK_NS`.
+//! The log time of a message is the due time of its tick, as `publish_time` is in a recording. Foxglove plots by log time;
+//! times of receipt would come in steps of `POLL_NS`.
 //!
-//! Must not be waited for by any role, nor take anything from a client. Who is slow, this process or a client, loses messages.
+//! Must not delay a role, nor accept input from a client. If this process or a client is slow, it loses messages.
 
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
@@ -22,28 +22,29 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// How much it gives way to everybody.
+/// Niceness of this process: it yields to all others.
 const NICENESS: i32 = 10;
-/// Between two looks at the samples, ns.
-const LOOK_NS: u64 = 5_000_000;
-/// The run is over when nothing has come for so long after its stop, ns.
+/// Interval between polls, ns.
+const POLL_NS: u64 = 5_000_000;
+/// Silence after the stop that ends the run, ns.
 const QUIET_NS: u64 = 100_000_000;
-/// Messages that may wait for one client; and they come to so many bytes at the most, where that is enough to go on.
-const WAITING: std::ops::RangeInclusive<usize> = 64..=4096;
-const WAITING_BYTES: usize = 16 << 20;
+/// Least and largest number of messages queued for one client.
+const BACKLOG: std::ops::RangeInclusive<usize> = 64..=4096;
+/// Bytes queued for one client, unless `BACKLOG` requires more.
+const BACKLOG_BYTES: usize = 16 << 20;
 
-/// What to show, and where.
+/// Source and address of a WebSocket.
 #[derive(Debug, Clone)]
-pub struct FoxgloveSeat {
-    /// The domain's directory, or that of the run's results; none is that of the newest run of this user.
+pub struct FoxgloveOptions {
+    /// The directory of the domain or of the run's results; `None` selects the user's newest run.
     pub domain: Option<PathBuf>,
-    /// Where to listen; at port 0 the system chooses one.
+    /// The address to listen on; port 0 lets the system choose a port.
     pub address: SocketAddr,
-    /// The file to tell the address in, instead of stderr.
+    /// The file to write the URL to, instead of stderr.
     pub tell: Option<PathBuf>,
 }
 
-/// Why a run could not be shown.
+/// A failure to publish a run.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum FoxgloveError {
@@ -51,11 +52,11 @@ pub enum FoxgloveError {
     #[error(transparent)]
     #[strum(transparent)]
     Run(#[from] RoleError),
-    /// The run's seats for readers are taken.
-    #[error("{source}; a run has room for few watchers, and of a fleet for one")]
+    /// The run has too many readers.
+    #[error("{source}; end another watcher: a run admits few, a fleet only one")]
     #[strum(serialize = "cannot-join")]
     Join {
-        /// The signal, and why.
+        /// The signal and the reason.
         source: BusError,
     },
     /// A link failed.
@@ -66,8 +67,8 @@ pub enum FoxgloveError {
     #[error(transparent)]
     #[strum(transparent)]
     Sample(#[from] RecordError),
-    /// The address cannot be had.
-    #[error("cannot listen on {address}: {reason}; name another address, or port 0 for any that is free")]
+    /// The address is not available.
+    #[error("cannot listen on {address}: {reason}; name another address, or port 0 for any free port")]
     #[strum(serialize = "cannot-listen")]
     Listen {
         /// The address.
@@ -75,7 +76,7 @@ pub enum FoxgloveError {
         /// The system's reason.
         reason: String,
     },
-    /// The address could not be told.
+    /// The file for the URL could not be written.
     #[error("cannot write {}: {source}", path.display())]
     #[strum(serialize = "cannot-write")]
     Tell {
@@ -86,22 +87,22 @@ pub enum FoxgloveError {
     },
 }
 
-/// Shows a run to its end, or until `terminated`.
+/// Publishes a run to its end, or until `terminated`.
 ///
 /// # Errors
 /// [`FoxgloveError`].
-pub fn run_foxglove(seat: &FoxgloveSeat, terminated: &AtomicBool) -> Result<(), FoxgloveError> {
-    let root = find_run(seat.domain.as_deref()).map_err(RoleError::from)?;
+pub fn run_foxglove(options: &FoxgloveOptions, terminated: &AtomicBool) -> Result<(), FoxgloveError> {
+    let root = find_run(options.domain.as_deref()).map_err(RoleError::from)?;
     let (domain, scenario) = join_complete(&root)?;
     let mut links = join_at_low_priority(&scenario, NICENESS, || Links::open(&domain, &scenario))
         .map_err(|source| FoxgloveError::Join { source })?;
-    let ended = show(seat, &scenario, &domain, &mut links, terminated);
+    let ended = publish(options, &scenario, &domain, &mut links, terminated);
     with_realtime_priority(|| drop(links));
     domain.remove_if_over();
     ended
 }
 
-/// Every signal, and the launcher's word. The node goes last.
+/// Links to all signals and to the launcher. The bus must be dropped last.
 struct Links {
     taps: Taps,
     schedule: <IoxBus as Bus>::Reader<Schedule>,
@@ -116,14 +117,16 @@ impl Links {
         Ok(Self { taps, schedule, _bus: bus })
     }
 
-    fn hear(&mut self) -> Result<Schedule, BusError> {
+    /// Returns the newest schedule; one of generation 0 if none has arrived.
+    fn schedule(&mut self) -> Result<Schedule, BusError> {
         while self.schedule.advance()? {}
         Ok(self.schedule.current().copied().unwrap_or_default())
     }
 }
 
-fn show(
-    seat: &FoxgloveSeat,
+/// Listens, reports the URL, and passes samples on.
+fn publish(
+    options: &FoxgloveOptions,
     scenario: &Scenario,
     domain: &Domain,
     links: &mut Links,
@@ -131,17 +134,17 @@ fn show(
 ) -> Result<(), FoxgloveError> {
     let mut channels = Channels::default();
     links.taps.announce(&mut channels)?;
-    // Its threads give way too: they have from this one what it has given up.
-    let server = listen(seat.address, scenario, &channels)?;
-    let url = format!("ws://{}", SocketAddr::new(seat.address.ip(), server.port()));
-    match &seat.tell {
+    // The server's threads inherit the low priority of this one.
+    let server = listen(options.address, scenario, &channels)?;
+    let url = format!("ws://{}", SocketAddr::new(options.address.ip(), server.port()));
+    match &options.tell {
         Some(path) => {
             write_whole(path, url.as_bytes()).map_err(|source| FoxgloveError::Tell { path: path.clone(), source })?
         }
         None => crate::system::tell(format_args!("foxglove: {url}")),
     }
     let ended = follow(links, domain, &mut channels, terminated);
-    // Not waited for: a client that does not read would never let it end.
+    // Does not wait for the server: a client that does not read would block it forever.
     server.stop().detach_all();
     ended
 }
@@ -155,47 +158,47 @@ fn listen(
         IpAddr::V4(ip) => ip.to_string(),
         IpAddr::V6(ip) => format!("[{ip}]"),
     };
-    let waiting = (WAITING_BYTES / channels.longest.max(1)).clamp(*WAITING.start(), *WAITING.end());
+    let backlog = (BACKLOG_BYTES / channels.longest.max(1)).clamp(*BACKLOG.start(), *BACKLOG.end());
     let server = WebSocketServer::new().name(format!("corotate {}", scenario.name)).bind(host, address.port());
-    server.message_backlog_size(waiting).start_blocking().map_err(|error| {
+    server.message_backlog_size(backlog).start_blocking().map_err(|error| {
         let reason = match error {
             foxglove::FoxgloveError::Bind(source) => source.to_string(),
-            other => other.to_string(),
+            error => error.to_string(),
         };
         FoxgloveError::Listen { address, reason }
     })
 }
 
-/// Passes on what comes, from the first tick, or the one at hand, to the last.
+/// Passes samples on from the first tick, or the current one, to the last.
 fn follow(
     links: &mut Links,
     domain: &Domain,
     channels: &mut Channels,
     terminated: &AtomicBool,
 ) -> Result<(), FoxgloveError> {
-    let mut came_ns = 0;
+    let mut last_sample_ns = 0;
     while !terminated.load(Ordering::Relaxed) && domain.exists() {
-        let (word, now_ns) = (links.hear()?, monotonic_ns());
-        let phase = Phase::from_number(word.phase);
+        let (schedule, now_ns) = (links.schedule()?, monotonic_ns());
+        let phase = Phase::from_number(schedule.phase);
         if phase >= Phase::Run {
-            links.taps.start(word.epoch_ns, Some(0));
+            links.taps.start(schedule.epoch_ns, Some(0));
             if links.taps.drain(channels)? > 0 {
-                came_ns = now_ns;
+                last_sample_ns = now_ns;
             }
         }
-        if phase == Phase::Stop && now_ns - came_ns > QUIET_NS {
+        if phase == Phase::Stop && now_ns - last_sample_ns > QUIET_NS {
             break;
         }
-        sleep_until(now_ns + LOOK_NS);
+        sleep_until(now_ns + POLL_NS);
     }
     Ok(())
 }
 
-/// The channels, by their numbers.
+/// The channels in the order of their numbers.
 #[derive(Default)]
 struct Channels {
     channels: Vec<Arc<RawChannel>>,
-    /// The longest message, bytes.
+    /// Length of the longest sample, bytes.
     longest: usize,
     message: Vec<u8>,
 }
@@ -209,7 +212,7 @@ impl MessageSink for Channels {
     ) -> Result<Channel, RecordError> {
         let schema = Schema::new(layout.message_name(), SCHEMA_ENCODING, layout.definition().into_bytes());
         let channel = ChannelBuilder::new(topic_of(service)).schema(schema).message_encoding(MESSAGE_ENCODING);
-        self.channels.push(channel.metadata(about).build_raw().expect("an encoding is all that a channel needs"));
+        self.channels.push(channel.metadata(about).build_raw().expect("a channel with an encoding is valid"));
         self.longest = self.longest.max(layout.size());
         Ok((self.channels.len() - 1) as Channel)
     }

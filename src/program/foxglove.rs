@@ -59,10 +59,10 @@ fn serve(_: &Arguments) -> Ended {
 
 #[cfg(feature = "foxglove")]
 fn serve(Arguments { domain, address, tell, parent }: &Arguments) -> Ended {
-    use crate::foxglove::{FoxgloveError, FoxgloveSeat, run_foxglove};
+    use crate::foxglove::{FoxgloveError, FoxgloveOptions, run_foxglove};
     let (domain, terminated) = super::runs::join(*parent, domain.as_deref())?;
-    let seat = FoxgloveSeat { domain: Some(domain), address: *address, tell: tell.clone() };
-    run_foxglove(&seat, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
+    let options = FoxgloveOptions { domain: Some(domain), address: *address, tell: tell.clone() };
+    run_foxglove(&options, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
         FoxgloveError::Run(_) => fail(Exit::Usage, error),
         _ => fail(Exit::Failure, error),
     })

@@ -2,7 +2,7 @@
 
 use super::output::{Ended, Exit, Failure, fail, remark, say};
 use super::runs::{self, join};
-use crate::record::{RecordError, RecorderSeat, Recording, RecordingReport, run_recorder};
+use crate::record::{RecordError, RecorderOptions, Recording, RecordingReport, run_recorder};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
@@ -47,8 +47,8 @@ pub fn record(arguments: &Arguments) -> Ended {
         return Err(fail(Exit::Usage, Failure::new("file-exists", reason)));
     }
     let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
-    let seat = RecorderSeat { domain, file: arguments.out.clone() };
-    let report = run_recorder(&seat, &terminated).map_err(|error| fail(exit_of(&error), error))?;
+    let options = RecorderOptions { domain, file: arguments.out.clone() };
+    let report = run_recorder(&options, &terminated).map_err(|error| fail(exit_of(&error), error))?;
     told(&report, arguments)
 }
 
@@ -105,9 +105,10 @@ pub fn exit_with(recording: &Recording, exit: Exit) -> Exit {
 /// Whether it lies with the file, or with what was asked.
 pub fn exit_of(error: &RecordError) -> Exit {
     match error {
-        RecordError::Run(_) | RecordError::Domain(_) | RecordError::NotOurs { .. } | RecordError::Scenario { .. } => {
-            Exit::Usage
-        }
+        RecordError::Run(_)
+        | RecordError::Domain(_)
+        | RecordError::NotARecording { .. }
+        | RecordError::Scenario { .. } => Exit::Usage,
         RecordError::Layout { .. } | RecordError::NotRecorded { .. } | RecordError::UnknownRole { .. } => Exit::Usage,
         RecordError::Read { source, .. } if source.kind() == ErrorKind::NotFound => Exit::Usage,
         RecordError::Damaged { .. } | RecordError::Incomplete { .. } => Exit::Failure,

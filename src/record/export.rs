@@ -1,7 +1,7 @@
-//! A recording as tables for everyone else: one file per signal, a row per sample.
+//! Exports a recording as tables: one file per signal, one row per sample.
 //!
-//! All tables are written in one pass over the recording, which may be larger than memory. Must not leave half a table under
-//! a table's name, nor change a bit.
+//! Writes all tables in one pass, because a recording may be larger than memory. Must not leave an incomplete table under
+//! its final name, nor change a bit.
 
 mod csv;
 #[cfg(feature = "parquet")]
@@ -22,7 +22,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use tempfile::TempPath;
 
-/// Why a recording is not exported.
+/// A failure to export a recording.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum ExportError {
@@ -39,22 +39,23 @@ pub enum ExportError {
         /// The system's reason.
         source: io::Error,
     },
-    /// A table has more columns than its form bears.
-    #[error("{service} has {columns} columns, more than the {most} that readers of Parquet bear; export it with --csv")]
+    /// A table has more columns than its format supports.
+    #[error("{service} has {columns} columns, but Parquet readers handle at most {most}; export it with --csv")]
     #[strum(serialize = "too-many-columns")]
     Wide {
         /// The signal.
         service: String,
-        /// How many columns its table has.
+        /// Number of columns.
         columns: usize,
-        /// How many are written at the most.
+        /// Largest number of columns.
         most: usize,
     },
 }
 
-/// Writes every signal as CSV, `<body>.<signal>.csv`, into a directory, which is made: the time in the run, s; when the
-/// sample was received, ns; then every element of every field, the stamp's first. All samples are in it, voids too, as they
-/// came. Returns the files.
+/// Writes every signal to `<body>.<signal>.csv` in a directory, which is created. Returns the files.
+///
+/// Columns: time in the run, s; time of receipt, ns; then every element of every field, beginning with the stamp. Rows:
+/// all samples and no-sample markers in the order of receipt.
 ///
 /// # Errors
 /// [`ExportError`].
@@ -69,8 +70,8 @@ pub fn export_csv(recording: &Recording, directory: &Path) -> Result<Vec<PathBuf
 #[cfg(feature = "parquet")]
 pub fn export_parquet(recording: &Recording, directory: &Path) -> Result<Vec<PathBuf>, ExportError> {
     use self::parquet::{COLUMNS_MAX, Parquet};
-    use self::table::OWN;
-    let width = |signal: &SignalInfo| OWN.len() + signal.layout.size() / 8;
+    use self::table::COMMON;
+    let width = |signal: &SignalInfo| COMMON.len() + signal.layout.size() / 8;
     match recording.signals().iter().find(|signal| width(signal) > COLUMNS_MAX) {
         Some(signal) => {
             let (service, columns) = (signal.service.clone(), width(signal));
@@ -84,28 +85,28 @@ fn export<T: Table>(recording: &Recording, directory: &Path) -> Result<Vec<PathB
     let failed = |source| ExportError::Write { path: directory.to_owned(), source };
     files::create_directories(directory).map_err(failed)?;
     let place = files::Directory::open(directory).map_err(failed)?;
-    let begin = |signal: &SignalInfo| Part::<T>::begin(recording, signal, &place, directory);
-    let mut parts = recording.signals().iter().map(begin).collect::<Result<Vec<_>, _>>()?;
+    let begin = |signal: &SignalInfo| TemporaryFile::<T>::begin(recording, signal, &place, directory);
+    let mut tables = recording.signals().iter().map(begin).collect::<Result<Vec<_>, _>>()?;
     let (mut bits, mut written) = (Vec::new(), Ok(()));
     recording.visit(|signal, received_ns, sample| {
-        // A pass cannot be ended before its end.
+        // `visit` cannot be stopped early.
         if written.is_ok() {
-            fill(&mut bits, recording.info().period_ns, received_ns, sample);
-            written = parts[signal].row(&bits);
+            set_row(&mut bits, recording.info().period_ns, received_ns, sample);
+            written = tables[signal].row(&bits);
         }
     })?;
     written?;
-    parts.into_iter().map(|part| part.end(&place)).collect()
+    tables.into_iter().map(|table| table.end(&place)).collect()
 }
 
-/// A table that does not have its name yet.
-struct Part<T> {
+/// A table under a temporary name.
+struct TemporaryFile<T> {
     path: PathBuf,
     file: TempPath,
     table: T,
 }
 
-impl<T: Table> Part<T> {
+impl<T: Table> TemporaryFile<T> {
     fn begin(
         recording: &Recording,
         signal: &SignalInfo,
@@ -114,13 +115,13 @@ impl<T: Table> Part<T> {
     ) -> Result<Self, ExportError> {
         let name = format!("{}.{}.{}", file_name(&signal.body), file_name(&signal.signal), T::EXTENSION);
         let path = directory.join(&name);
-        // Like any file that is made, for whom the user's mask allows.
+        // The umask applies, as for any new file.
         let permissions = Permissions::from_mode(0o666);
-        let made =
+        let created =
             tempfile::Builder::new().prefix(&name).suffix(".part").permissions(permissions).tempfile_in(place.path());
-        let begun = made.and_then(|made| {
-            let (file, part) = made.into_parts();
-            Ok((part, T::begin(file.into(), recording, signal)?))
+        let begun = created.and_then(|created| {
+            let (file, path) = created.into_parts();
+            Ok((path, T::begin(file.into(), recording, signal)?))
         });
         match begun {
             Ok((file, table)) => Ok(Self { path, file, table }),
@@ -132,6 +133,7 @@ impl<T: Table> Part<T> {
         self.table.row(bits).map_err(|source| ExportError::Write { path: self.path.clone(), source })
     }
 
+    /// Completes the table and gives it its final name.
     fn end(self, place: &files::Directory) -> Result<PathBuf, ExportError> {
         let Self { path, file, table } = self;
         let named = place.path().join(path.file_name().unwrap_or_default());
@@ -142,13 +144,13 @@ impl<T: Table> Part<T> {
     }
 }
 
-/// A name from a file is not to lead anywhere else.
+/// Replaces characters that could make a recorded name lead out of the directory.
 fn file_name(name: &str) -> String {
     name.chars().map(|letter| if letter.is_ascii_alphanumeric() || letter == '-' { letter } else { '_' }).collect()
 }
 
-/// Makes a sample a row.
-fn fill(bits: &mut Vec<u64>, period_ns: u64, received_ns: u64, sample: &[u8]) {
+/// Sets `bits` to the row of a sample.
+fn set_row(bits: &mut Vec<u64>, period_ns: u64, received_ns: u64, sample: &[u8]) {
     let stamp: Stamp = bytemuck::pod_read_unaligned(&sample[..size_of::<Stamp>()]);
     let time_s = stamp.tick as f64 * (period_ns as f64 / 1e9);
     bits.clear();

@@ -1,19 +1,19 @@
-//! Every sample of a run in one file, by a process that no role waits for; and what can be done with such a file.
+//! Recordings: writes every sample of a run to one file, and reads, replays, compares and exports such files.
 //!
 //! | file | duty |
 //! |---|---|
 //! | `layout` | the layout of a sample as a ROS 2 message definition |
-//! | `writer` | the MCAP file: chunks of bounded age, a full disk |
-//! | `taps` | takes every sample of a run off a bus, and keeps count |
-//! | `recorder` | a recording in the making, and its counters |
-//! | `process` | the recorder as a process beside a loop |
-//! | `reader` | a recording as data: metadata, signals, samples, columns |
-//! | `script` | what a role did, so that it can do it again |
-//! | `replay` | recorded inputs through the live roles, outputs compared bit for bit |
-//! | `diff` | two recordings beside each other |
-//! | `export` | tables for everyone else: CSV and, with the feature of that name, Parquet |
+//! | `writer` | writes the MCAP file: chunks of bounded age, full disks |
+//! | `taps` | takes every sample of a run off a bus, and counts it |
+//! | `recorder` | writes a run to a file, and compares its counters with those of the roles |
+//! | `process` | runs the recorder as a process beside a loop |
+//! | `reader` | reads metadata, signals, samples and columns |
+//! | `script` | reconstructs the ticks that a role executed, and their inputs |
+//! | `replay` | feeds recorded inputs to the live roles, and compares their outputs bit for bit |
+//! | `diff` | compares two recordings |
+//! | `export` | writes tables as CSV and, with the feature of that name, Parquet |
 //!
-//! Must not change a sample, nor hold a loop up, except by the credit that it gives in lockstep.
+//! Must not change a sample, nor delay a loop, except by its credit in lockstep.
 
 mod diff;
 mod export;
@@ -31,7 +31,7 @@ pub use export::export_parquet;
 #[cfg(feature = "parquet")]
 pub(crate) use export::{Cell, ColumnKind, RowGroups};
 pub use export::{ExportError, export_csv};
-pub use process::{RecorderSeat, run_recorder};
+pub use process::{RecorderOptions, run_recorder};
 pub use reader::{EndInfo, Recording, RunInfo, SignalInfo, Track};
 pub(crate) use recorder::{JOINING, RECORDER};
 pub use recorder::{Recorder, RecordingReport, SignalReport};
@@ -49,7 +49,7 @@ use crate::system::remedy;
 use std::io;
 use std::path::PathBuf;
 
-/// What can go wrong with a recording.
+/// A failure to write, read or replay a recording.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum RecordError {
@@ -57,7 +57,7 @@ pub enum RecordError {
     #[error(transparent)]
     #[strum(transparent)]
     Run(#[from] RoleError),
-    /// The domain is none.
+    /// The domain is invalid.
     #[error(transparent)]
     #[strum(transparent)]
     Domain(#[from] DomainError),
@@ -69,8 +69,8 @@ pub enum RecordError {
     #[error(transparent)]
     #[strum(transparent)]
     Node(#[from] NodeError),
-    /// There is no room for more.
-    #[error("the disk is full: {} ends here, readable ({source}); free some room, or record elsewhere with --out", path.display())]
+    /// The disk is full.
+    #[error("the disk is full: {} ends early but is readable ({source}); free space, or record elsewhere with --out", path.display())]
     #[strum(serialize = "disk-full")]
     Full {
         /// The recording.
@@ -79,7 +79,7 @@ pub enum RecordError {
         source: io::Error,
     },
     /// The file cannot be written.
-    #[error("cannot write {}: {source}; it ends with its last whole chunk, readable without an index", path.display())]
+    #[error("cannot write {}: {source}; the file ends with its last whole chunk, and is readable without an index", path.display())]
     #[strum(serialize = "cannot-write")]
     Write {
         /// The recording.
@@ -96,48 +96,48 @@ pub enum RecordError {
         /// The system's reason.
         source: io::Error,
     },
-    /// The file is none of ours.
-    #[error("{} is no recording of corotate: {reason}; `corotate run --record` makes one", path.display())]
+    /// The file is not a recording of corotate.
+    #[error("{} is not a corotate recording: {reason}; make one with `corotate run --record`", path.display())]
     #[strum(serialize = "not-a-recording")]
-    NotOurs {
+    NotARecording {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The first deviation from the format.
         reason: String,
     },
-    /// The file is not what was written.
+    /// The file was changed after it was written.
     #[error(
-        "{} is damaged: {reason}; take another copy of it. --accept-incomplete uses what comes before, and still fails",
+        "{} is damaged: {reason}; use another copy. --accept-incomplete reads the part before the damage, and still fails",
         path.display()
     )]
     #[strum(serialize = "damaged-recording")]
     Damaged {
         /// The recording.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The first damage.
         reason: String,
     },
-    /// The file has not all of its run.
-    #[error("{} is not complete: {missing}; go on with what there is by --accept-incomplete", path.display())]
+    /// The recording lacks a part of its run.
+    #[error("{} is incomplete: {missing}; use the recorded part with --accept-incomplete", path.display())]
     #[strum(serialize = "incomplete-recording")]
     Incomplete {
         /// The recording.
         path: PathBuf,
-        /// What is missing.
+        /// The missing part.
         missing: String,
     },
-    /// The scenario in the recording is refused.
-    #[error("the scenario in {} is refused by this version: {source}", path.display())]
+    /// The scenario in the recording is invalid in this version.
+    #[error("this version refuses the scenario in {}: {source}", path.display())]
     #[strum(serialize = "refused-scenario")]
     Scenario {
         /// The recording.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: Box<ConfigError>,
     },
-    /// The recording was made with samples of another layout.
+    /// The layouts of a signal differ.
     #[error(
-        "{service} was recorded as {recorded}, and this version has {ours}; replay it with the version that made it"
+        "{service} was recorded as {recorded}, but this version has {ours}; replay it with the version that recorded it"
     )]
     #[strum(serialize = "other-layout")]
     Layout {
@@ -145,11 +145,11 @@ pub enum RecordError {
         service: String,
         /// The layout in the recording.
         recorded: String,
-        /// This version's.
+        /// The layout in this version, or in the second recording.
         ours: String,
     },
-    /// A signal of the scenario is not in the recording.
-    #[error("{} has no signal {service}; record the run with this version", path.display())]
+    /// The recording lacks a signal of the scenario.
+    #[error("{} has no signal {service}; record the run again with this version", path.display())]
     NotRecorded {
         /// The recording.
         path: PathBuf,
@@ -157,11 +157,11 @@ pub enum RecordError {
         service: String,
     },
     /// The recording has no such role.
-    #[error("--role {role}: there is no such role; this recording has: {known}, all")]
+    #[error("--role {role}: unknown role; choose one of: {known}, all")]
     UnknownRole {
-        /// As given.
+        /// The given name.
         role: String,
-        /// The roles that it has.
+        /// The roles in the recording.
         known: String,
     },
 }

@@ -1,9 +1,9 @@
-//! A recording as data: what is known of the run, its signals, and their samples as bytes, stamps and columns of numbers.
+//! Reads recordings: the run's metadata, its signals, and their samples as bytes, stamps and columns of numbers.
 //!
-//! Reads the file from its beginning, so that one without an end is read as far as it goes. Every byte is under a checksum: a
-//! chunk's is looked at before its samples are used, metadata has its own, and the whole file's is looked at last. What was
-//! changed is told by [`Recording::damage`], what is missing by [`Recording::incomplete`]. Must not ask for memory that the
-//! file is too short for, nor use a sample whose checksum is wrong.
+//! Reads from the beginning, so a file without an end is read up to its last whole chunk. A checksum covers every byte: a
+//! chunk's is checked before its samples are used, metadata has its own, and that of the whole file is checked last.
+//! [`Recording::damage`] reports changes, [`Recording::incomplete`] missing parts. Must not allocate more than the file
+//! can fill, nor use a sample whose checksum is wrong.
 
 use super::RecordError;
 use super::recorder::{END, RUN, SCHEMA, SignalReport, layouts};
@@ -22,16 +22,16 @@ use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_64;
 
-/// No sample of ours is longer, bytes.
+/// Largest sample of a recording, bytes.
 const SAMPLE_BYTES: usize = 64 << 20;
-/// No record of ours is longer, packed or not: a chunk may hold one sample beyond its size.
+/// Largest record, compressed or not: a chunk may exceed its size by one sample.
 const RECORD_BYTES: usize = 2 * SAMPLE_BYTES;
-/// How much is read at once, if nothing larger is asked for, bytes.
+/// Least number of bytes per read.
 const READ_BYTES: usize = 64 << 10;
-/// An opcode and a length, before every record; bytes.
+/// Opcode and length before every record, bytes.
 const RECORD_HEAD: usize = 9;
 
-/// A recording that was opened.
+/// An open recording.
 ///
 /// ```
 /// use corotate::config::SHIPPED;
@@ -63,33 +63,33 @@ pub struct Recording {
     info: RunInfo,
     signals: Vec<SignalInfo>,
     flaw: Option<Flaw>,
-    /// The last tick of which there is a sample.
+    /// The last recorded tick.
     last_tick: Option<u64>,
 }
 
-/// Why a file is not read to its end.
+/// The reason that a file cannot be read to its end.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Flaw {
-    /// It was cut off: what there is of it is as it was written.
+    /// The file was cut off; the rest is unchanged.
     Cut(&'static str),
-    /// It was changed.
+    /// The file was changed.
     Damaged(String),
 }
 
-/// What a recording says of its run.
+/// Metadata of the recorded run.
 #[derive(Debug, Clone, Default)]
 pub struct RunInfo {
     /// The run's identifier, if it has one.
     pub run: Option<RunId>,
-    /// The program's version and source revision.
+    /// The program's version.
     pub version: String,
     /// The source revision.
     pub revision: String,
-    /// The scenario as resolved, a TOML text; its name and its hash.
+    /// The resolved scenario, as TOML.
     pub scenario: String,
     /// The scenario's name.
     pub scenario_name: String,
-    /// The hash of its text.
+    /// The hash of the scenario text.
     pub scenario_hash: String,
     /// The seed of all randomness.
     pub seed: u64,
@@ -99,24 +99,24 @@ pub struct RunInfo {
     pub period_ns: u64,
     /// The last tick of the scenario.
     pub last_tick: u64,
-    /// T_0 on the run's monotonic clock, ns; 0 where there was no time.
+    /// T_0 on the run's monotonic clock, ns; 0 unless the clock is real time.
     pub epoch_ns: u64,
-    /// Whether it was begun before the first tick.
+    /// True if the recording began before the first tick.
     pub whole: bool,
-    /// When the recording was begun.
+    /// Time at which the recording began.
     pub started_utc: String,
     /// The machine, as JSON.
     pub host: String,
-    /// What was written at the end; none if there is no end.
+    /// Metadata from the end of the file; `None` if the file was cut off.
     pub end: Option<EndInfo>,
 }
 
-/// What a recording says at its end.
+/// Metadata written when a recording ends.
 #[derive(Debug, Clone, Default)]
 pub struct EndInfo {
-    /// Whether every published sample is in it.
+    /// True if the recording has every published sample.
     pub complete: bool,
-    /// Why not.
+    /// The reason that the recording is incomplete; empty if it is complete or only began late.
     pub problem: String,
     /// The counters of every signal.
     pub signals: Vec<SignalReport>,
@@ -129,36 +129,36 @@ pub struct EndInfo {
 /// A recorded signal.
 #[derive(Debug, Clone)]
 pub struct SignalInfo {
-    /// The service's name; the body's and the signal's own, and the role that wrote it.
+    /// The service.
     pub service: String,
     /// The body.
     pub body: String,
-    /// The signal's own name.
+    /// The signal's name.
     pub signal: String,
-    /// The role that wrote it.
+    /// The role that published it.
     pub role: String,
     /// The layout of its samples.
     pub layout: Layout,
-    /// How many samples there are, of any kind.
+    /// Number of samples and no-sample markers.
     pub samples: u64,
     channel: u16,
 }
 
-/// The samples of one signal, in the order in which they came.
+/// The samples of one signal, in the order of receipt.
 #[derive(Debug)]
 pub struct Track {
     /// The signal.
     pub info: SignalInfo,
-    /// When each came, ns on the recorder's monotonic clock.
+    /// Time of receipt of each sample, ns on the recorder's monotonic clock.
     pub received_ns: Vec<u64>,
     bytes: Vec<u8>,
 }
 
 impl Recording {
-    /// Opens a recording: reads all of it once.
+    /// Opens a recording and reads it once, from beginning to end.
     ///
     /// # Errors
-    /// [`RecordError::Read`], [`RecordError::NotOurs`], [`RecordError::Damaged`] if nothing of it can be believed.
+    /// [`RecordError::Read`], [`RecordError::NotARecording`]; [`RecordError::Damaged`] if the run's metadata is damaged.
     pub fn open(path: &Path) -> Result<Self, RecordError> {
         let mut content = Content::default();
         let (mut counts, mut ticks) = (BTreeMap::<u16, u64>::new(), BTreeMap::<u16, u64>::new());
@@ -167,16 +167,16 @@ impl Recording {
             *counts.entry(channel).or_default() += 1;
             ticks.insert(channel, stamp.tick);
         })?;
-        let not_ours = |reason: String| RecordError::NotOurs { path: path.to_owned(), reason };
+        let not_a_recording = |reason: String| RecordError::NotARecording { path: path.to_owned(), reason };
         let run = content.metadata.remove(RUN).ok_or_else(|| match flaw.clone() {
             Some(Flaw::Damaged(reason)) if content.begun => RecordError::Damaged { path: path.to_owned(), reason },
-            Some(Flaw::Damaged(reason)) => not_ours(reason),
-            Some(Flaw::Cut(reason)) => not_ours(format!("{reason}, before anything was written about a run")),
-            None => not_ours("it says nothing of a run".to_owned()),
+            Some(Flaw::Damaged(reason)) => not_a_recording(reason),
+            Some(Flaw::Cut(reason)) => not_a_recording(format!("{reason}; metadata `{RUN}` is missing")),
+            None => not_a_recording(format!("metadata `{RUN}` is missing")),
         })?;
-        let info = RunInfo::read(&run, content.metadata.get(END)).map_err(not_ours)?;
+        let info = RunInfo::read(&run, content.metadata.get(END)).map_err(not_a_recording)?;
         if info.scenario_hash != format!("{:016x}", xxh3_64(info.scenario.as_bytes())) {
-            let reason = "the scenario is not the one of which it has the hash".to_owned();
+            let reason = "the scenario does not match its hash".to_owned();
             return Err(RecordError::Damaged { path: path.to_owned(), reason });
         }
         let mut signals = content.signals;
@@ -187,22 +187,22 @@ impl Recording {
         Ok(Self { path: path.to_owned(), info, signals, flaw, last_tick })
     }
 
-    /// Where it lies.
+    /// Returns the file's path.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// What it says of its run.
+    /// Returns the metadata of the run.
     pub fn info(&self) -> &RunInfo {
         &self.info
     }
 
-    /// Its signals, in the order of a tick.
+    /// Returns the signals in the order of a tick.
     pub fn signals(&self) -> &[SignalInfo] {
         &self.signals
     }
 
-    /// What was changed in the file, if anything was. What comes before that, and has a checksum that is right, is read.
+    /// Returns the first damage to the file, if any. The part before it is readable.
     pub fn damage(&self) -> Option<&str> {
         match &self.flaw {
             Some(Flaw::Damaged(reason)) => Some(reason),
@@ -210,26 +210,28 @@ impl Recording {
         }
     }
 
-    /// What the recording lacks of its run, if it lacks anything. What it has is as it was recorded.
+    /// Describes the part of the run that the recording lacks, if any.
     pub fn incomplete(&self) -> Option<String> {
         let mut missing = Vec::new();
         if !self.info.whole {
-            missing.push("it was begun in the midst of the run".to_owned());
+            missing.push("recording began during the run".to_owned());
         }
         match (&self.flaw, &self.info.end) {
             (Some(Flaw::Cut(reason)), _) => missing.push((*reason).to_owned()),
-            (None, None) => missing.push("it does not say how it ended".to_owned()),
+            (None, None) => missing.push(format!("metadata `{END}` is missing")),
             (None, Some(end)) if !end.problem.is_empty() => missing.push(end.problem.clone()),
-            // Begun late is all that is wrong.
-            (None, Some(end)) if !end.complete && self.info.whole => missing.push("it says so itself".to_owned()),
+            // A recording that began late is never complete; that is already reported.
+            (None, Some(end)) if !end.complete && self.info.whole => {
+                missing.push("the recorder marked it incomplete".to_owned());
+            }
             _ => {}
         }
-        let last_tick = self.last_tick.map_or("it has no sample".to_owned(), |tick| format!("its last tick is {tick}"));
+        let last_tick = self.last_tick.map_or("no samples".to_owned(), |tick| format!("last recorded tick {tick}"));
         let text = missing.join("; ");
         (!text.is_empty()).then(|| format!("{text}; {last_tick} of {}", self.info.last_tick))
     }
 
-    /// Refuses a recording that is not what was recorded, or not all of it.
+    /// Returns an error if the recording is damaged or incomplete.
     ///
     /// # Errors
     /// [`RecordError::Damaged`], [`RecordError::Incomplete`].
@@ -241,7 +243,7 @@ impl Recording {
         self.incomplete().map_or(Ok(()), |missing| Err(RecordError::Incomplete { path: path(), missing }))
     }
 
-    /// Its scenario, to be run again.
+    /// Parses the recorded scenario.
     ///
     /// # Errors
     /// [`RecordError::Scenario`].
@@ -249,7 +251,7 @@ impl Recording {
         self.parse(&[])
     }
 
-    /// The same under the clock by which every recording is replayed, lockstep.
+    /// Parses the recorded scenario with the clock `lockstep`, in which every recording is replayed.
     ///
     /// # Errors
     /// [`RecordError::Scenario`].
@@ -263,7 +265,7 @@ impl Recording {
             .map_err(|error| RecordError::Scenario { path: self.path.clone(), source: Box::new(error) })
     }
 
-    /// What the scenario had go wrong.
+    /// Returns the injected faults of the scenario.
     ///
     /// # Errors
     /// [`RecordError::Scenario`].
@@ -271,7 +273,7 @@ impl Recording {
         Ok(self.scenario()?.faults.clone())
     }
 
-    /// The samples of some signals, of all of them if `wanted` says so, in memory.
+    /// Reads all samples of the wanted signals into memory.
     ///
     /// # Errors
     /// [`RecordError::Read`], [`RecordError::Damaged`] if the file has changed since it was opened.
@@ -279,7 +281,7 @@ impl Recording {
         let chosen = self.signals.iter().filter(|signal| wanted(signal));
         let track = |info: &SignalInfo| Track { info: info.clone(), received_ns: Vec::new(), bytes: Vec::new() };
         let mut tracks: Vec<Track> = chosen.map(track).collect();
-        self.again(|channel, received_ns, sample| {
+        self.rescan(|channel, received_ns, sample| {
             if let Some(track) = tracks.iter_mut().find(|track| track.info.channel == channel) {
                 track.received_ns.push(received_ns);
                 track.bytes.extend_from_slice(sample);
@@ -288,32 +290,33 @@ impl Recording {
         Ok(tracks)
     }
 
-    /// Shows every sample in the order in which they came, and keeps none: the index of its signal, when it came in ns on the
-    /// recorder's monotonic clock, its bytes.
+    /// Calls `each` for every sample in the order of receipt, without keeping them in memory.
+    ///
+    /// Its arguments: the index of the signal, the time of receipt in ns on the recorder's monotonic clock, the bytes.
     ///
     /// # Errors
     /// [`RecordError::Read`], [`RecordError::Damaged`] if the file has changed since it was opened.
     pub fn visit(&self, mut each: impl FnMut(usize, u64, &[u8])) -> Result<(), RecordError> {
-        self.again(|channel, received_ns, sample| {
+        self.rescan(|channel, received_ns, sample| {
             if let Some(index) = self.signals.iter().position(|signal| signal.channel == channel) {
                 each(index, received_ns, sample);
             }
         })
     }
 
-    /// Reads the file once more, which must be what it was.
-    fn again(&self, sample: impl FnMut(u16, u64, &[u8])) -> Result<(), RecordError> {
+    /// Reads the file again, and checks that it has not changed.
+    fn rescan(&self, sample: impl FnMut(u16, u64, &[u8])) -> Result<(), RecordError> {
         let mut content = Content::default();
         let flaw = scan(&self.path, &mut content, sample)?;
-        let same = |(now, then): (&SignalInfo, &SignalInfo)| (now.channel, &now.layout) == (then.channel, &then.layout);
+        let same = |(new, old): (&SignalInfo, &SignalInfo)| (new.channel, &new.layout) == (old.channel, &old.layout);
         if flaw != self.flaw || !content.signals.iter().zip(&self.signals).all(same) {
-            let reason = "it has changed since it was opened".to_owned();
+            let reason = "the file has changed since it was opened".to_owned();
             return Err(RecordError::Damaged { path: self.path.clone(), reason });
         }
         Ok(())
     }
 
-    /// Checks that every signal has the layout that this version gives it.
+    /// Checks that every signal has the layout of this version.
     ///
     /// # Errors
     /// [`RecordError::Layout`], [`RecordError::NotRecorded`].
@@ -334,41 +337,41 @@ impl Recording {
 }
 
 impl Track {
-    /// How many samples there are.
+    /// Returns the number of samples.
     pub fn len(&self) -> usize {
         self.received_ns.len()
     }
 
-    /// Whether there are none.
+    /// Returns true if the signal has no samples.
     pub fn is_empty(&self) -> bool {
         self.received_ns.is_empty()
     }
 
-    /// The bytes of a sample, stamp and content.
+    /// Returns the bytes of a sample: stamp and content.
     pub fn sample(&self, index: usize) -> &[u8] {
         let size = self.info.layout.size();
         &self.bytes[index * size..][..size]
     }
 
-    /// The stamp of a sample.
+    /// Returns the stamp of a sample.
     pub fn stamp(&self, index: usize) -> Stamp {
         bytemuck::pod_read_unaligned(&self.sample(index)[..size_of::<Stamp>()])
     }
 
-    /// One element of a field of unsigned numbers in a sample; none if there is no such field.
+    /// Returns the first element of an unsigned field in a sample; `None` if there is no such field.
     pub(super) fn unsigned(&self, index: usize, name: &str) -> Option<u64> {
         let column = self.info.layout.columns.iter().find(|column| column.name == name)?;
         (column.kind == FieldKind::U64).then(|| u64::from_le_bytes(self.word(index, column.offset)))
     }
 
-    /// One element of a field as it is in a sample: 8 bytes.
+    /// Returns the 8 bytes of a field's element in a sample.
     fn word(&self, index: usize, offset: usize) -> [u8; 8] {
         let mut word = [0; 8];
         word.copy_from_slice(&self.sample(index)[offset..offset + 8]);
         word
     }
 
-    /// One element of a field in a sample, as a number.
+    /// Returns a field's element in a sample as a number.
     pub fn value(&self, index: usize, column: usize, element: usize) -> f64 {
         let column = &self.info.layout.columns[column];
         let word = self.word(index, column.offset + 8 * element);
@@ -378,7 +381,7 @@ impl Track {
         }
     }
 
-    /// The samples that the loop was given: every one that is the first of its tick and no void, by their indexes.
+    /// Returns the indexes of the regular samples: the first of each tick, in ascending order, without no-sample markers.
     pub fn regular(&self) -> impl Iterator<Item = usize> + '_ {
         let mut next = 0;
         (0..self.len()).filter(move |index| {
@@ -391,14 +394,14 @@ impl Track {
         })
     }
 
-    /// One element of a field over all [regular](Self::regular) samples; none if there is no such field.
+    /// Returns a field's element over all [regular](Self::regular) samples; `None` if there is no such field.
     pub fn column(&self, name: &str, element: usize) -> Option<Vec<f64>> {
         let columns = &self.info.layout.columns;
         let column = columns.iter().position(|column| column.name == name && element < column.count)?;
         Some(self.regular().map(|index| self.value(index, column, element)).collect())
     }
 
-    /// The ticks of all [regular](Self::regular) samples.
+    /// Returns the ticks of all [regular](Self::regular) samples.
     pub fn ticks(&self) -> Vec<u64> {
         self.regular().map(|index| self.stamp(index).tick).collect()
     }
@@ -406,12 +409,13 @@ impl Track {
 
 impl RunInfo {
     fn read(run: &BTreeMap<String, String>, end: Option<&BTreeMap<String, String>>) -> Result<Self, String> {
-        let text = |key: &str| run.get(key).cloned().ok_or_else(|| format!("it does not say `{key}`"));
-        let number = |key: &str| text(key)?.parse().map_err(|_| format!("`{key}` is no number"));
+        let text = |key: &str| run.get(key).cloned().ok_or_else(|| format!("metadata `{key}` is missing"));
+        let number = |key: &str| text(key)?.parse().map_err(|_| format!("metadata `{key}` is not a number"));
         if text("schema")? != SCHEMA {
-            return Err(format!("it is laid out as {}, and this version reads {SCHEMA}", text("schema")?));
+            return Err(format!("its format is {}, but this version reads {SCHEMA}", text("schema")?));
         }
-        let run = run.get("run").map(|id| id.parse()).transpose().map_err(|_| "`run` is no identifier".to_owned())?;
+        let run = run.get("run").map(|id| id.parse()).transpose();
+        let run = run.map_err(|_| "metadata `run` is not a run identifier".to_owned())?;
         Ok(Self {
             run,
             version: text("version")?,
@@ -433,7 +437,7 @@ impl RunInfo {
 }
 
 impl EndInfo {
-    /// What cannot be read is left out: the end only adds to what the samples say.
+    /// Reads the end metadata. An unreadable entry is left empty, because samples can be read without it.
     fn read(end: &BTreeMap<String, String>) -> Self {
         let text = |key: &str| end.get(key).map_or("", String::as_str);
         Self {
@@ -446,14 +450,14 @@ impl EndInfo {
     }
 }
 
-/// What a file has besides samples.
+/// The contents of a file except samples.
 #[derive(Default)]
 struct Content {
-    /// Whether it begins as a file of this kind.
+    /// True once the header has been read.
     begun: bool,
     schemas: BTreeMap<u16, (String, String)>,
     signals: Vec<SignalInfo>,
-    /// The length of a sample by channel.
+    /// Bytes per sample, by channel.
     sizes: BTreeMap<u16, usize>,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
     data_ended: bool,
@@ -461,48 +465,48 @@ struct Content {
 }
 
 impl Content {
-    /// Takes in a record that is in no chunk. Samples and what describes them are not: outside, nothing vouches for them.
-    fn record(&mut self, record: Record<'_>) -> Result<(), String> {
+    /// Reads a record outside of chunks. Ignores schemas and channels there, because no checksum covers them.
+    fn read_record(&mut self, record: Record<'_>) -> Result<(), String> {
         match record {
             Record::Header(_) => self.begun = true,
             Record::Metadata(mut metadata) => {
                 let name = metadata.name;
-                let kept = metadata.metadata.remove(CHECKSUM);
-                // Another version's may have none, and is refused as such.
-                let other = metadata.metadata.get("schema").is_some_and(|schema| schema != SCHEMA);
-                let without = kept.is_none() && name == RUN && other;
-                if !without && kept.as_ref() != Some(&checksum(&name, &metadata.metadata)) {
-                    return Err(format!("the checksum of its metadata `{name}` is wrong"));
+                let recorded = metadata.metadata.remove(CHECKSUM);
+                // A file of another version may have no checksum; it is refused later, because of its version.
+                let foreign = metadata.metadata.get("schema").is_some_and(|schema| schema != SCHEMA);
+                let exempt = recorded.is_none() && name == RUN && foreign;
+                if !exempt && recorded.as_ref() != Some(&checksum(&name, &metadata.metadata)) {
+                    return Err(format!("the checksum of metadata `{name}` is wrong"));
                 }
                 if self.metadata.contains_key(&name) {
-                    return Err(format!("it has its metadata `{name}` twice"));
+                    return Err(format!("metadata `{name}` occurs twice"));
                 }
                 self.metadata.insert(name, metadata.metadata);
             }
             Record::DataEnd(_) if std::mem::replace(&mut self.data_ended, true) => {
-                return Err("its data end twice".to_owned());
+                return Err("the data section ends twice".to_owned());
             }
-            Record::Footer(_) if !self.data_ended => return Err("it ends before its data do".to_owned()),
+            Record::Footer(_) if !self.data_ended => return Err("the footer is before the end of the data".to_owned()),
             Record::Footer(_) => self.ended = true,
-            Record::Message { .. } => return Err("it has a sample outside of a chunk".to_owned()),
+            Record::Message { .. } => return Err("a sample is outside of the chunks".to_owned()),
             _ => {}
         }
         Ok(())
     }
 
-    /// Takes in a chunk: nothing of it before its checksum is known to be right.
-    fn chunk(
+    /// Reads a chunk after checking its checksum.
+    fn read_chunk(
         &mut self,
         reader: &mut LinearReader,
         record: &[u8],
         sample: &mut impl FnMut(u16, u64, &[u8]),
     ) -> Result<(), String> {
-        let words = |error: McapError| error.to_string();
-        let Record::Chunk { header, .. } = mcap::parse_record(op::CHUNK, record).map_err(words)? else {
-            return Err("a chunk is none".to_owned());
+        let text = |error: McapError| error.to_string();
+        let Record::Chunk { header, .. } = mcap::parse_record(op::CHUNK, record).map_err(text)? else {
+            return Err("a chunk is malformed".to_owned());
         };
         if header.compression != "lz4" || header.uncompressed_crc == 0 || self.data_ended {
-            return Err("it has a chunk that this program does not write".to_owned());
+            return Err("a chunk is not LZ4-compressed, has no checksum, or follows the end of the data".to_owned());
         }
         let room = reader.insert(RECORD_HEAD + record.len());
         room[0] = op::CHUNK;
@@ -510,32 +514,38 @@ impl Content {
         room[RECORD_HEAD..].copy_from_slice(record);
         reader.notify_read(RECORD_HEAD + record.len());
         while let Some(event) = reader.next_event() {
-            match event.map_err(words)? {
+            match event.map_err(text)? {
                 LinearReadEvent::ReadRequest(_) => break,
                 LinearReadEvent::Record { data, opcode } => {
-                    self.content(mcap::parse_record(opcode, data).map_err(words)?, sample)?;
+                    self.read_chunk_record(mcap::parse_record(opcode, data).map_err(text)?, sample)?;
                 }
             }
         }
         Ok(())
     }
 
-    /// Takes in a record of a chunk.
-    fn content(&mut self, record: Record<'_>, sample: &mut impl FnMut(u16, u64, &[u8])) -> Result<(), String> {
+    /// Reads a record of a chunk.
+    fn read_chunk_record(
+        &mut self,
+        record: Record<'_>,
+        sample: &mut impl FnMut(u16, u64, &[u8]),
+    ) -> Result<(), String> {
         match record {
             Record::Schema { header, data } => {
                 let text = String::from_utf8_lossy(&data).into_owned();
                 self.schemas.insert(header.id, (header.encoding, text));
             }
             Record::Channel(channel) if !self.sizes.contains_key(&channel.id) => {
-                let (encoding, text) = self.schemas.get(&channel.schema_id).ok_or("a channel lacks its schema")?;
-                let ours = encoding == "ros2msg" && channel.message_encoding == "cdr";
-                let layout = Layout::parse(text).filter(|layout| ours && layout.size() < SAMPLE_BYTES);
-                let layout = layout.ok_or_else(|| format!("{} has no samples of ours", channel.topic))?;
+                let topic = &channel.topic;
+                let schema = self.schemas.get(&channel.schema_id);
+                let (encoding, text) = schema.ok_or_else(|| format!("the schema of channel {topic} is missing"))?;
+                let encoded = encoding == "ros2msg" && channel.message_encoding == "cdr";
+                let layout = Layout::parse(text).filter(|layout| encoded && layout.size() < SAMPLE_BYTES);
+                let layout = layout.ok_or_else(|| format!("the schema of channel {topic} is unsupported"))?;
                 let about = |key: &str| channel.metadata.get(key).cloned().unwrap_or_default();
                 let (body, signal) = (about("body"), about("signal"));
-                if self.signals.iter().any(|other| (&other.body, &other.signal) == (&body, &signal)) {
-                    return Err(format!("{} is of the same signal as another channel", channel.topic));
+                if self.signals.iter().any(|known| (&known.body, &known.signal) == (&body, &signal)) {
+                    return Err(format!("channel {topic} has the signal of another channel"));
                 }
                 self.sizes.insert(channel.id, layout.size());
                 let (service, role) = (about("service"), about("role"));
@@ -543,12 +553,10 @@ impl Content {
                 self.signals.push(SignalInfo { service, body, signal, role, layout, samples: 0, channel });
             }
             Record::Message { header, data } => {
-                let size = self.sizes.get(&header.channel_id).ok_or("a sample is of no channel")?;
+                let (sequence, channel) = (header.sequence, header.channel_id);
+                let size = self.sizes.get(&channel).ok_or_else(|| format!("channel {channel} is not declared"))?;
                 if data.len() != CDR_HEADER.len() + size || data[..CDR_HEADER.len()] != CDR_HEADER {
-                    return Err(format!(
-                        "sample {} of channel {} has another length",
-                        header.sequence, header.channel_id
-                    ));
+                    return Err(format!("sample {sequence} of channel {channel} does not match its schema"));
                 }
                 sample(header.channel_id, header.log_time, &data[CDR_HEADER.len()..]);
             }
@@ -558,7 +566,7 @@ impl Content {
     }
 }
 
-/// Reads a file from its beginning as far as it goes, and tells why not further.
+/// Reads a file from its beginning. Returns the reason if it cannot be read to its end.
 fn scan(
     path: &Path,
     content: &mut Content,
@@ -568,16 +576,16 @@ fn scan(
     let mut file = files::open(path).map_err(failed)?;
     let mut unread = file.metadata().map_err(failed)?.len();
     let mut last = [0; MAGIC.len()];
-    // What has its end was not cut off, whatever lengths it tells.
-    let whole = match unread.checked_sub(MAGIC.len() as u64) {
+    // A file with its end magic was not cut off: a record that is too long for it has a damaged length.
+    let has_end = match unread.checked_sub(MAGIC.len() as u64) {
         Some(at) => {
-            file.read_exact_at(&mut last, at).map(|()| last == *MAGIC).or_else(cut_meanwhile).map_err(failed)?
+            file.read_exact_at(&mut last, at).map(|()| last == *MAGIC).or_else(false_if_truncated).map_err(failed)?
         }
         None => false,
     };
-    let cut = |reason| match whole {
+    let cut = || match has_end {
         true => Flaw::Damaged("a record is longer than the rest of the file".to_owned()),
-        false => Flaw::Cut(reason),
+        false => Flaw::Cut("the file has no end: the recorder was killed, or the disk was full"),
     };
     let limited = LinearReaderOptions::default().with_record_length_limit(RECORD_BYTES);
     let mut reader = LinearReader::new_with_options(
@@ -593,7 +601,7 @@ fn scan(
     );
     while let Some(event) = reader.next_event() {
         let taken = match event {
-            // Behind the end it asks whether there is anything else.
+            // After the footer the reader requests more, to check that nothing follows.
             Ok(LinearReadEvent::ReadRequest(wanted)) if wanted as u64 <= unread || content.ended => {
                 let wanted = wanted.max(READ_BYTES).min(unread.max(1) as usize);
                 let read = file.read(reader.insert(wanted)).map_err(failed)?;
@@ -601,14 +609,16 @@ fn scan(
                 reader.notify_read(read);
                 Ok(())
             }
-            Ok(LinearReadEvent::ReadRequest(_)) => return Ok(Some(cut(CUT))),
-            Ok(LinearReadEvent::Record { data, opcode: op::CHUNK }) => content.chunk(&mut chunks, data, &mut sample),
+            Ok(LinearReadEvent::ReadRequest(_)) => return Ok(Some(cut())),
+            Ok(LinearReadEvent::Record { data, opcode: op::CHUNK }) => {
+                content.read_chunk(&mut chunks, data, &mut sample)
+            }
             Ok(LinearReadEvent::Record { data, opcode }) => {
                 let record = mcap::parse_record(opcode, data).map_err(|error| error.to_string());
-                record.and_then(|record| content.record(record))
+                record.and_then(|record| content.read_record(record))
             }
-            // So a chunk is begun; its length is written when it is closed.
-            Err(McapError::RecordTooLarge { opcode: op::CHUNK, len: u64::MAX }) => return Ok(Some(cut(CUT))),
+            // An open chunk has this length until it is closed.
+            Err(McapError::RecordTooLarge { opcode: op::CHUNK, len: u64::MAX }) => return Ok(Some(cut())),
             Err(error) => Err(error.to_string()),
         };
         if let Err(reason) = taken {
@@ -618,9 +628,7 @@ fn scan(
     Ok(None)
 }
 
-const CUT: &str = "it has no end: its recorder was killed, or the disk was full";
-
-/// A file that becomes shorter while it is read has no end.
-fn cut_meanwhile(error: io::Error) -> io::Result<bool> {
+/// Returns false if the file was truncated while being read; passes other errors on.
+fn false_if_truncated(error: io::Error) -> io::Result<bool> {
     if error.kind() == io::ErrorKind::UnexpectedEof { Ok(false) } else { Err(error) }
 }

@@ -1,4 +1,4 @@
-//! Writes what the taps take to a file, and holds what came against the counters of the roles. Must not judge a sample.
+//! Writes all samples of a run to a file, and compares its counters with those of the roles. Must not judge a sample.
 
 use super::RecordError;
 use super::taps::{SignalCounters, Taps};
@@ -16,61 +16,62 @@ use std::path::Path;
 use std::time::SystemTime;
 use xxhash_rust::xxh3::xxh3_64;
 
-/// The recorder's name where a role would have its own.
+/// The recorder's name in links and reports.
 pub(crate) const RECORDER: &str = "recorder";
-/// The tick told to the launcher by a recorder that joined late and lacks a sample of some signal.
+/// The tick in the heartbeat of a recorder that joined late and still lacks a sample of some signal.
 pub(crate) const JOINING: u64 = u64::MAX;
 /// Layout version of the metadata.
 pub const SCHEMA: &str = "corotate/recording/v2";
-/// The metadata record that is written first, and the one that is written last.
+/// Name of the metadata record at the beginning.
 pub const RUN: &str = "corotate.run";
+/// Name of the metadata record at the end.
 pub const END: &str = "corotate.end";
 
-/// How a recording went: what is in it, and what is not.
+/// The result of a recording.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RecordingReport {
     /// The file.
     pub file: String,
-    /// Whether every sample that was published is in it.
+    /// True if the recording has every published sample.
     pub complete: bool,
-    /// Whether it was begun before the first tick.
+    /// True if the recording began before the first tick.
     pub whole: bool,
-    /// What ended it before its time, or kept it from being complete.
+    /// The reason that the recording ended early or is incomplete.
     pub problem: Option<String>,
-    /// The stable name of the problem.
+    /// The error code of the problem.
     #[serde(default)]
     pub code: Option<String>,
-    /// Samples written, of all signals.
+    /// Number of samples and no-sample markers in the file.
     pub messages: u64,
-    /// The file's length.
+    /// Length of the file.
     pub bytes: u64,
-    /// Per signal.
+    /// The recorded signals.
     pub signals: Vec<SignalReport>,
 }
 
-/// The counters of one recorded signal, beside those of its writer.
+/// The counters of one recorded signal and of its writer.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SignalReport {
     /// The service.
     pub service: String,
-    /// Ticks of which there is a sample.
+    /// Number of ticks with a sample.
     pub recorded: u64,
-    /// Ticks of which there is a void.
+    /// Number of ticks with a no-sample marker.
     pub void: u64,
-    /// Samples beside the one of their tick: second, late, broken ones.
+    /// Number of further samples: duplicates, late ones, ones with an impossible tick.
     pub extra: u64,
-    /// Samples that its writer published by its own counters; none if it keeps none.
+    /// Number of published samples by the writer's counters; `None` if unknown.
     pub published: Option<u64>,
-    /// Published and not recorded, though it came to this host; none if that is not known.
+    /// Number of samples that were published, reached this host, and are not recorded; `None` if unknown.
     pub lost: Option<u64>,
-    /// Published on another host, and lost on the way here.
+    /// Number of samples that were published on another host and did not reach this one.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub lost_between_hosts: u64,
-    /// The last tick of which there is something.
+    /// The last tick with a sample or marker.
     pub last_tick: Option<u64>,
-    /// Ticks, first and last, of which there is nothing: never published, or lost.
+    /// First and last ticks of stretches without sample or marker: not published, or lost.
     pub gaps: Vec<[u64; 2]>,
-    /// Gaps beyond those told.
+    /// Number of gaps that are not listed.
     pub more_gaps: u64,
 }
 
@@ -94,7 +95,7 @@ impl SignalReport {
         }
     }
 
-    /// Holds what was recorded against the counters of the roles. Again, if the loop went on after the recording.
+    /// Compares this signal with the roles' counters. May be repeated if the loop went on after the recording.
     fn reconcile(&mut self, roles: &[RoleReport], between_hosts: &dyn Fn(&str) -> u64) {
         let Some(link) = roles.iter().flat_map(|role| &role.written).find(|link| link.service == self.service) else {
             return;
@@ -112,24 +113,24 @@ impl SignalReport {
 }
 
 impl RecordingReport {
-    /// Holds the recording against the roles' final counters. `between_hosts` tells how much of a signal was lost on the way to this
-    /// host.
+    /// Compares the recording with the roles' final counters. `between_hosts` returns the number of a signal's samples that
+    /// were lost on the way to this host.
     pub fn reconcile(&mut self, roles: &[RoleReport], between_hosts: &dyn Fn(&str) -> u64) {
         self.signals.iter_mut().for_each(|signal| signal.reconcile(roles, between_hosts));
         let lost: u64 = self.signals.iter().filter_map(|signal| signal.lost).sum();
-        // Whoever began in the midst of a run knew that.
+        // A recording that began during the run is incomplete anyway.
         if let (true, None, 1..) = (self.whole, &self.problem, lost) {
             self.code = Some("samples-lost".to_owned());
             self.problem = Some(format!(
-                "{lost} samples were published and are not in the recording; if it did not keep up, record again with \
-                 fewer other programs, or at a lower tick_hz"
+                "{lost} published samples are not in the recording: it may not have kept up; record again with fewer other \
+                 programs, or at a lower tick_hz"
             ));
         }
         self.complete = self.whole && self.problem.is_none();
     }
 }
 
-/// A recording in the making.
+/// A recording in progress.
 pub struct Recorder {
     taps: Taps,
     signals: Vec<SignalReport>,
@@ -150,18 +151,18 @@ impl Recorder {
             signals: Vec::new(),
             writer: Writer::create(path)?,
             file: path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
-            run: about(scenario),
+            run: run_metadata(scenario),
             begun: false,
         })
     }
 
-    /// Connects to every writer that there is now: what these send is taken even if they are gone by then.
+    /// Connects to all current writers, so that their samples arrive even if they end before the next poll.
     pub fn connect(&mut self) {
         self.taps.connect();
     }
 
-    /// Begins the file, once the epoch of the ticks is known: 0 where there is no time. If ticks have run, `joined` is
-    /// the first that is taken.
+    /// Begins the file. `epoch_ns` is the time of tick 0, or 0 unless the clock is real time. In a run that has begun, `joined`
+    /// is the first tick to record.
     ///
     /// # Errors
     /// [`RecordError::Write`].
@@ -175,27 +176,27 @@ impl Recorder {
         self.writer.metadata(RUN, run)
     }
 
-    /// Writes whatever has come; returns how many samples.
+    /// Writes the samples that have arrived, and returns their number.
     ///
     /// # Errors
-    /// [`RecordError`]; the file can be [finished](Self::finish) then.
+    /// [`RecordError`]; the file can still be [finished](Self::finish).
     pub fn poll(&mut self) -> Result<u64, RecordError> {
         let taken = self.taps.drain(&mut self.writer)?;
-        self.writer.turn(monotonic_ns())?;
+        self.writer.close_due_chunk(monotonic_ns())?;
         Ok(taken)
     }
 
-    /// The tick of which not every signal is here yet.
+    /// Returns the first tick that some signal still lacks.
     pub fn next_tick(&mut self) -> u64 {
         self.taps.next_tick()
     }
 
-    /// Closes every signal, before [the end](Self::finish).
+    /// Closes all links and keeps their counters. [`Self::finish`] does so too.
     pub fn leave(&mut self) {
         self.signals.extend(self.taps.close().into_iter().map(SignalReport::new));
     }
 
-    /// Ends the file, with the counters of the recording beside those of the roles. `problem` is what ended it before its time.
+    /// Ends the file with the counters of the recording and of the roles. `problem` is the reason of an early end.
     pub fn finish(mut self, roles: &[RoleReport], problem: Option<&RecordError>) -> RecordingReport {
         self.leave();
         let mut report = RecordingReport {
@@ -245,11 +246,11 @@ fn code(error: &RecordError) -> String {
 }
 
 fn json(value: &impl Serialize) -> String {
-    serde_json::to_string(value).expect("books of plain values are JSON")
+    serde_json::to_string(value).expect("plain values serialize to JSON")
 }
 
-/// What the file says of its run.
-fn about(scenario: &Scenario) -> BTreeMap<String, String> {
+/// Returns the metadata of a run.
+fn run_metadata(scenario: &Scenario) -> BTreeMap<String, String> {
     let (host, text) = (MachineInfo::local(), scenario.to_toml());
     let entries = [
         ("schema", SCHEMA.to_owned()),
@@ -269,9 +270,8 @@ fn about(scenario: &Scenario) -> BTreeMap<String, String> {
     entries.into_iter().chain(run).map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
-/// The layout of every signal of a scenario in this version, by service, in the order of a tick.
+/// Returns the service and layout of every signal of a scenario, in the order of a tick.
 pub(super) fn layouts(scenario: &Scenario) -> Vec<(String, Layout)> {
-    let of = |role| ports(scenario, role).writes;
-    let written = RoleId::all(scenario).into_iter().flat_map(of);
-    written.map(|port| (port.topic.to_string(), Layout::from_fields(port.type_name, &port.fields))).collect()
+    let outputs = RoleId::all(scenario).into_iter().flat_map(|role| ports(scenario, role).writes);
+    outputs.map(|port| (port.topic.to_string(), Layout::from_fields(port.type_name, &port.fields))).collect()
 }

@@ -1,7 +1,7 @@
-//! Recorded inputs through a live, unmodified role, and what it publishes beside what was recorded, bit for bit.
+//! Replays a role: feeds the recorded inputs to the live, unmodified role, and compares its outputs bit for bit.
 //!
-//! Here the role is driven in one thread; [`crate::launch`] does it with a process, by the same script and the same
-//! comparison. The time at which a sample was sent is no output and not compared.
+//! Drives the role in one thread; [`crate::launch`] drives a process with the same script and comparison. Does not compare
+//! the time of sending and the generation, which are not outputs of the role.
 
 use super::RecordError;
 use super::reader::{Recording, Track};
@@ -14,44 +14,44 @@ use crate::scenario::Scenario;
 use crate::scenario::build;
 use crate::telemetry::Ledger;
 
-/// The columns that say by which of a role's processes a sample was sent, and when: no output of the role.
+/// The columns that are not compared: they describe the sending process.
 const SENDER: [&str; 2] = ["generation", "sent_ns"];
 
-/// The first thing in which a role's output differs from what was recorded.
+/// The first difference between a role's output and the recording.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Difference {
-    /// The tick of the recorded sample, or of the one that is not recorded.
+    /// The tick of the recorded sample, or of a sample that is not recorded.
     pub tick: u64,
     /// The signal.
     pub service: String,
-    /// Which element of which field; none if one of the two samples does not exist.
+    /// The field and, for arrays, the element; `None` if one of the samples is missing.
     pub field: Option<String>,
-    /// What was recorded.
+    /// The recorded value.
     pub recorded: String,
-    /// What the role says now.
+    /// The replayed value.
     pub replayed: String,
 }
 
-/// How one role's replay went.
+/// The result of one role's replay.
 #[derive(Debug, Clone)]
 pub struct RoleReplay {
     /// The role.
     pub role: String,
-    /// Ticks that it executed.
+    /// Number of executed ticks.
     pub ticks: u64,
-    /// Lives that it had.
+    /// Number of generations.
     pub lives: u64,
-    /// Samples compared.
+    /// Number of compared samples.
     pub samples: u64,
-    /// The first difference, if there is any.
+    /// The first difference.
     pub difference: Option<Difference>,
-    /// From where on nothing can be said.
+    /// The end of the part that can be compared; `None` if all of it can.
     pub limit: Option<Limit>,
 }
 
-/// Writing ends for a role's inputs.
+/// Writers of a role's inputs.
 pub struct Inlets(Vec<WordWriter>);
-/// Reading ends for a role's outputs.
+/// Readers of a role's outputs.
 pub struct Outlets(Vec<WordReader>);
 
 impl Inlets {
@@ -64,7 +64,7 @@ impl Inlets {
         Ok(Self(ports(scenario, role).reads.iter().map(|port| port.writer(bus)).collect::<Result<_, _>>()?))
     }
 
-    /// Sends a sample, given as its bytes, on an input.
+    /// Sends the bytes of a sample on an input.
     ///
     /// # Errors
     /// [`BusError::Send`].
@@ -72,7 +72,7 @@ impl Inlets {
         self.0[input].send(bytes)
     }
 
-    /// Lets a reader that has come later know of these ends.
+    /// Connects to readers that have been opened since.
     ///
     /// # Errors
     /// [`BusError::Send`].
@@ -92,28 +92,28 @@ impl Outlets {
     }
 }
 
-/// Compares what a role publishes with what it published.
+/// A comparison of a role's outputs with the recorded ones.
 pub struct Comparer<'a> {
     tracks: &'a [Track],
-    /// Per output, the next recorded sample to compare with.
+    /// Per output, the index of the next recorded sample to compare.
     next: Vec<usize>,
-    /// Per output, the tick after the last that has come.
-    come: Vec<u64>,
+    /// Per output, the tick after the last received one.
+    next_ticks: Vec<u64>,
     realtime: bool,
     limit: Option<u64>,
-    /// The role may go on beyond its script; that is not looked at.
+    /// The tick after the script's last. Later outputs are ignored.
     end: u64,
     samples: u64,
     difference: Option<Difference>,
 }
 
 impl<'a> Comparer<'a> {
-    /// A comparison that has not begun.
+    /// Creates a comparison with the recorded outputs of a script.
     pub fn new(script: &'a Script) -> Self {
         Self {
             tracks: &script.outputs,
             next: vec![0; script.outputs.len()],
-            come: vec![0; script.outputs.len()],
+            next_ticks: vec![0; script.outputs.len()],
             end: script.steps.last().map_or(0, |step| step.tick + 1),
             realtime: script.realtime,
             limit: script.limit.as_ref().map(|limit| limit.tick),
@@ -122,41 +122,43 @@ impl<'a> Comparer<'a> {
         }
     }
 
-    /// Takes whatever has come; true if some has.
+    /// Compares the outputs that have arrived. Returns true if there were any.
     ///
     /// # Errors
     /// [`BusError::Receive`].
     pub fn take(&mut self, outlets: &mut Outlets) -> Result<bool, BusError> {
-        let mut some = false;
+        let mut any = false;
         for (output, outlet) in outlets.0.iter_mut().enumerate() {
             while let Some(words) = outlet.next()? {
-                some = true;
+                any = true;
                 self.compare(output, bytemuck::cast_slice(words));
             }
         }
-        Ok(some)
+        Ok(any)
     }
 
-    /// Real time has no voids: in its replay they stand for what was not published.
-    fn counts(&self, stamp: &Stamp) -> bool {
+    /// Returns true if a sample is to be compared: not warm-up and, in real time, not a no-sample marker. Only the lockstep
+    /// replay publishes markers, where the run in real time published nothing.
+    fn is_compared(&self, stamp: &Stamp) -> bool {
         stamp.generation != 0 && !(self.realtime && stamp.generation & NO_SAMPLE != 0)
     }
 
-    fn beyond(&self, tick: u64) -> bool {
+    /// Returns true if a tick is after the part that can be compared.
+    fn is_beyond(&self, tick: u64) -> bool {
         tick >= self.end || self.limit.is_some_and(|limit| tick >= limit)
     }
 
-    /// The tick before which everything has come.
+    /// Returns the first tick that some output still lacks.
     pub fn next_tick(&self) -> u64 {
-        self.come.iter().copied().min().unwrap_or(0)
+        self.next_ticks.iter().copied().min().unwrap_or(0)
     }
 
     fn compare(&mut self, output: usize, bytes: &[u8]) {
         let stamp: Stamp = bytemuck::pod_read_unaligned(&bytes[..size_of::<Stamp>()]);
         if stamp.generation != 0 {
-            self.come[output] = self.come[output].max(stamp.tick.saturating_add(1).min(self.end));
+            self.next_ticks[output] = self.next_ticks[output].max(stamp.tick.saturating_add(1).min(self.end));
         }
-        if !self.counts(&stamp) {
+        if !self.is_compared(&stamp) {
             return;
         }
         let (track, index) = (&self.tracks[output], self.next[output]);
@@ -165,48 +167,49 @@ impl<'a> Comparer<'a> {
             return;
         }
         if index >= track.len() {
-            // A recording that was cut off says nothing of what comes after.
-            if !self.beyond(stamp.tick) {
-                self.differ(stamp.tick, track, None, "nothing".to_owned(), "a sample".to_owned());
+            // After the end of a truncated recording a sample is not a difference.
+            if !self.is_beyond(stamp.tick) {
+                self.add_difference(stamp.tick, track, None, "nothing".to_owned(), "a sample".to_owned());
             }
             return;
         }
         let recorded = track.stamp(index);
-        if self.beyond(recorded.tick.min(stamp.tick)) {
+        if self.is_beyond(recorded.tick.min(stamp.tick)) {
             return;
         }
         self.samples += 1;
         for column in &track.info.layout.columns {
             for element in 0..column.count {
                 let at = column.offset + 8 * element;
-                let (was, is) = (&track.sample(index)[at..at + 8], &bytes[at..at + 8]);
-                if was != is && !SENDER.contains(&column.name.as_str()) {
+                let (old, new) = (&track.sample(index)[at..at + 8], &bytes[at..at + 8]);
+                if old != new && !SENDER.contains(&column.name.as_str()) {
                     let name = column.elements().nth(element);
-                    self.differ(recorded.tick, track, name, words(column.kind, was), words(column.kind, is));
+                    self.add_difference(recorded.tick, track, name, text(column.kind, old), text(column.kind, new));
                     return;
                 }
             }
         }
     }
 
-    fn differ(&mut self, tick: u64, track: &Track, field: Option<String>, recorded: String, replayed: String) {
+    /// Keeps a difference if it is the earliest.
+    fn add_difference(&mut self, tick: u64, track: &Track, field: Option<String>, recorded: String, replayed: String) {
         if self.difference.as_ref().is_none_or(|first| tick < first.tick) {
             let service = track.info.service.clone();
             self.difference = Some(Difference { tick, service, field, recorded, replayed });
         }
     }
 
-    /// Closes the comparison of a role up to the step `last`: what is recorded and did not come is a difference too.
+    /// Ends the comparison after the executed `steps`. A recorded sample that was not replayed is a difference too.
     pub fn finish(mut self, script: &Script, steps: &[Step], limit: Option<Limit>) -> RoleReplay {
         let end = limit.as_ref().map_or(u64::MAX, |limit| limit.tick);
-        // Behind the last step nothing is sent any more, late or not.
+        // After the last step nothing is sent, not even late samples.
         let sent_before = end.min(steps.last().map_or(0, |step| step.tick + 1));
         for (output, track) in self.tracks.iter().enumerate() {
-            if let Some(index) = (self.next[output]..track.len()).find(|index| self.counts(&track.stamp(*index))) {
+            if let Some(index) = (self.next[output]..track.len()).find(|index| self.is_compared(&track.stamp(*index))) {
                 let tick = track.stamp(index).tick;
-                // One that a fault delayed may have been sent behind the end.
+                // An injected delay may have moved the sample past the end.
                 if tick.saturating_add(script.late_ticks) < sent_before {
-                    self.differ(tick, track, None, "a sample".to_owned(), "nothing".to_owned());
+                    self.add_difference(tick, track, None, "a sample".to_owned(), "nothing".to_owned());
                 }
             }
         }
@@ -221,8 +224,8 @@ impl<'a> Comparer<'a> {
     }
 }
 
-/// A value for people, with its bits where it is a number.
-fn words(kind: FieldKind, bytes: &[u8]) -> String {
+/// Formats a value; a floating-point number with its bits.
+fn text(kind: FieldKind, bytes: &[u8]) -> String {
     let mut word = [0; 8];
     word.copy_from_slice(bytes);
     match kind {
@@ -231,7 +234,7 @@ fn words(kind: FieldKind, bytes: &[u8]) -> String {
     }
 }
 
-/// Replays a role of a recording in this thread. `scenario` is the recording's with the clock `lockstep`.
+/// Replays a role in this thread. `scenario` is that of [`Recording::scenario_for_replay`].
 ///
 /// # Errors
 /// [`RecordError`].
@@ -241,7 +244,7 @@ pub fn replay_in_process(recording: &Recording, scenario: &Scenario, role: RoleI
     let ledger = private_ledger(scenario, role);
     let mut outlets = Outlets::open(scenario, role, &bus)?;
     let mut comparer = Comparer::new(&script);
-    let mut stage = Stage {
+    let mut replayed = ReplayedRole {
         script: &script,
         scenario,
         bus: &bus,
@@ -251,16 +254,16 @@ pub fn replay_in_process(recording: &Recording, scenario: &Scenario, role: RoleI
         bytes: Vec::new(),
     };
     for number in 0..script.steps.len() {
-        if comparer.beyond(script.steps[number].tick) {
+        if comparer.is_beyond(script.steps[number].tick) {
             break;
         }
-        stage.play(number, &mut || comparer.take(&mut outlets).map(drop))?;
+        replayed.execute_step(number, &mut || comparer.take(&mut outlets).map(drop))?;
     }
     Ok(comparer.finish(&script, &script.steps, script.limit.clone()))
 }
 
-/// A role on its stage.
-struct Stage<'a> {
+/// A role that is driven by its script.
+struct ReplayedRole<'a> {
     script: &'a Script,
     scenario: &'a Scenario,
     bus: &'a MemoryBus,
@@ -270,11 +273,15 @@ struct Stage<'a> {
     bytes: Vec<u8>,
 }
 
-impl Stage<'_> {
-    /// Plays one step: feeds what the role had, one tick after the other, and lets it execute.
-    fn play(&mut self, number: usize, look: &mut dyn FnMut() -> Result<(), BusError>) -> Result<(), NodeError> {
+impl ReplayedRole<'_> {
+    /// Executes one step: feeds the recorded inputs tick by tick, and calls `compare` after each.
+    fn execute_step(
+        &mut self,
+        number: usize,
+        compare: &mut dyn FnMut() -> Result<(), BusError>,
+    ) -> Result<(), NodeError> {
         let step = self.script.steps[number];
-        self.enter(step)?;
+        self.restart_until(step)?;
         let Some(node) = &mut self.node else { return Ok(()) };
         let plant = matches!(self.script.role, RoleId::Plant(_));
         if plant {
@@ -292,22 +299,22 @@ impl Stage<'_> {
                     node.finish_tick()?;
                 }
             }
-            look()?;
+            compare()?;
         }
         Ok(())
     }
 
-    /// Builds the role anew for every life that it had.
-    fn enter(&mut self, step: Step) -> Result<(), NodeError> {
+    /// Starts the role, and restarts it until it has the generation of the step.
+    fn restart_until(&mut self, step: Step) -> Result<(), NodeError> {
         while self.node.is_none() || self.ledger.generation() < step.generation {
-            if let Some(mut left) = self.node.take() {
-                left.finish()?;
+            if let Some(mut predecessor) = self.node.take() {
+                predecessor.finish()?;
             }
             let (script, scenario) = (self.script, self.scenario);
             let mut node = build(scenario, script.role, self.bus, self.ledger)?;
-            // Memory of one's own is always open. A life without a tick hands on what it was given.
+            // The state is in private memory, so restoring it does not fail. A generation that executed no tick passes it on.
             if node.restore().is_ok() && self.ledger.generation() >= step.generation {
-                // Others than a body pass over what the outage took tick by tick: of a long one the links would not hold all.
+                // A body skips an outage at once. Other roles pass it tick by tick, because links hold few samples.
                 let body = matches!(script.role, RoleId::Plant(_));
                 let first_tick = if body && step.generation > 1 { step.tick } else { node.next_tick() };
                 node.start(script.grid, first_tick)?;

@@ -1,7 +1,7 @@
-//! Takes every sample of a run off a bus, the truth included, and passes it on as the message of its channel.
+//! Takes every sample of a run off a bus, truth included, and passes it to a sink as a message of its channel.
 //!
-//! Warm-up samples apart, whatever was sent is passed on, as it was: second, late and broken samples too. Must not judge, nor
-//! know what becomes of a message.
+//! Passes on all samples unchanged except warm-up: duplicates, late and malformed samples too. Must not judge a sample, nor
+//! depend on the sink.
 
 use super::RecordError;
 use crate::bus::Port;
@@ -13,15 +13,15 @@ use crate::sample::{Layout, NO_SAMPLE, Stamp};
 use crate::scenario::Scenario;
 use std::collections::BTreeMap;
 
-/// The most gaps that are told one by one.
-const GAPS_TOLD: usize = 1000;
+/// Largest number of gaps that are listed.
+const GAPS_LISTED: usize = 1000;
 
 /// The number of a channel.
 pub type Channel = u16;
 
-/// Where messages go.
+/// A receiver of messages.
 pub trait MessageSink {
-    /// Announces a signal. `about` is told of it besides.
+    /// Adds a channel for a signal, with the metadata `about`.
     ///
     /// # Errors
     /// [`RecordError::Write`].
@@ -32,10 +32,10 @@ pub trait MessageSink {
         about: BTreeMap<String, String>,
     ) -> Result<Channel, RecordError>;
 
-    /// Takes one sample as it is. Times are ns: when its tick was due, and where players put it.
+    /// Takes one sample. `due_ns` is the due time of its tick, `logged_ns` the time by which players sort it.
     ///
     /// # Errors
-    /// [`RecordError::Full`] if there is no room for it. [`RecordError::Write`].
+    /// [`RecordError::Full`] if the disk is full. [`RecordError::Write`].
     fn message(
         &mut self,
         channel: Channel,
@@ -46,39 +46,39 @@ pub trait MessageSink {
     ) -> Result<(), RecordError>;
 }
 
-/// What has come of one signal.
+/// Counters of the samples of one signal.
 #[derive(Default)]
 pub struct SignalCounters {
-    /// The tick behind the last one of which something has come.
+    /// The tick after the last one with a sample or marker.
     pub next: u64,
     begun: bool,
-    /// Ticks of which there is a sample.
+    /// Number of ticks with a sample.
     pub recorded: u64,
-    /// Ticks of which there is a void.
+    /// Number of ticks with a no-sample marker.
     pub void: u64,
-    /// Samples beside the one of their tick.
+    /// Number of duplicate, late and impossible samples.
     pub extra: u64,
-    /// Ticks, first and last, of which there is nothing.
+    /// First and last ticks of stretches without sample or marker.
     pub gaps: Vec<[u64; 2]>,
-    /// Gaps beyond those told.
+    /// Number of gaps that are not listed.
     pub more_gaps: u64,
 }
 
 impl SignalCounters {
-    /// Enters a sample; `due` is the last tick that it can be of.
-    fn enter(&mut self, stamp: &Stamp, due: u64) {
-        if stamp.tick < self.next || stamp.tick > due {
+    /// Counts a sample or marker; `max_tick` is the last tick that it can have.
+    fn count(&mut self, stamp: &Stamp, max_tick: u64) {
+        if stamp.tick < self.next || stamp.tick > max_tick {
             self.extra += 1;
             return;
         }
-        self.gap_to(stamp.tick);
+        self.add_gap_before(stamp.tick);
         *(if stamp.generation & NO_SAMPLE == 0 { &mut self.recorded } else { &mut self.void }) += 1;
         (self.next, self.begun) = (stamp.tick + 1, true);
     }
 
-    fn gap_to(&mut self, tick: u64) {
+    fn add_gap_before(&mut self, tick: u64) {
         if tick > self.next {
-            if self.gaps.len() < GAPS_TOLD {
+            if self.gaps.len() < GAPS_LISTED {
                 self.gaps.push([self.next, tick - 1]);
             } else {
                 self.more_gaps += 1;
@@ -87,8 +87,8 @@ impl SignalCounters {
     }
 }
 
-/// What a tap needs to pass on what it takes.
-struct Desk<'a> {
+/// The sink and the run's ticks, as each tap needs them.
+struct TapContext<'a> {
     sink: &'a mut dyn MessageSink,
     grid: Grid,
     joined: Option<u64>,
@@ -96,7 +96,7 @@ struct Desk<'a> {
     realtime: bool,
 }
 
-/// One signal.
+/// A reader of one signal.
 struct Tap {
     port: Port,
     role: String,
@@ -106,27 +106,27 @@ struct Tap {
 }
 
 impl Tap {
-    /// Passes on whatever has come; returns how many samples.
-    fn drain(&mut self, desk: &mut Desk<'_>) -> Result<u64, RecordError> {
+    /// Passes on the samples that have arrived, and returns their number.
+    fn drain(&mut self, context: &mut TapContext<'_>) -> Result<u64, RecordError> {
         let mut taken = 0;
         while let Some(words) = self.reader.next()? {
             let body = bytemuck::cast_slice(words);
             let stamp: Stamp = bytemuck::pod_read_unaligned(&body[..size_of::<Stamp>()]);
-            if (stamp.generation == 0 || desk.joined.is_some_and(|from| stamp.tick < from)) && !self.counters.begun {
+            if (stamp.generation == 0 || context.joined.is_some_and(|from| stamp.tick < from)) && !self.counters.begun {
                 continue;
             }
             let now_ns = monotonic_ns();
-            let due = match (desk.realtime, self.counters.begun) {
-                (true, _) => desk.grid.tick_at(now_ns).min(desk.last_tick),
-                // Where nothing can be lost, a sample is of the next tick or of none.
-                (false, true) if desk.joined.is_none() => self.counters.next,
-                (false, _) => desk.last_tick,
+            let max_tick = match (context.realtime, self.counters.begun) {
+                (true, _) => context.grid.tick_at(now_ns).min(context.last_tick),
+                // A lossless link delivers the next tick; any other tick is malformed.
+                (false, true) if context.joined.is_none() => self.counters.next,
+                (false, _) => context.last_tick,
             };
-            let due_ns = if stamp.tick <= desk.last_tick { desk.grid.due_ns(stamp.tick) } else { now_ns };
-            // Only real time has another time than that of the ticks.
-            let logged_ns = if desk.realtime { now_ns } else { due_ns };
-            desk.sink.message(self.channel, stamp.tick as u32, due_ns, logged_ns, body)?;
-            self.counters.enter(&stamp, due);
+            let due_ns = if stamp.tick <= context.last_tick { context.grid.due_ns(stamp.tick) } else { now_ns };
+            // Without real time, the due time of the tick is the only meaningful one.
+            let logged_ns = if context.realtime { now_ns } else { due_ns };
+            context.sink.message(self.channel, stamp.tick as u32, due_ns, logged_ns, body)?;
+            self.counters.count(&stamp, max_tick);
             taken += 1;
         }
         Ok(taken)
@@ -147,7 +147,7 @@ impl Tap {
     }
 }
 
-/// Every signal of a run.
+/// Readers of all signals of a run.
 pub struct Taps {
     taps: Vec<Tap>,
     grid: Grid,
@@ -178,18 +178,18 @@ impl Taps {
         })
     }
 
-    /// Sets the epoch of the ticks, once it is known: 0 where there is no time; and the first tick that is taken, if
-    /// some have run.
+    /// Sets the time of tick 0, which is 0 unless the clock is real time, and the first tick to take in a run that has begun.
     pub fn start(&mut self, epoch_ns: u64, joined: Option<u64>) {
         (self.grid.epoch_ns, self.joined) = (epoch_ns, joined);
     }
 
-    /// Connects to every writer that there is now: what these send is taken even if they are gone by then.
+    /// Connects to all current writers, so that their samples arrive even if they end before the next call of
+    /// [`Self::drain`].
     pub fn connect(&mut self) {
         self.taps.iter_mut().for_each(|tap| tap.reader.refresh());
     }
 
-    /// Announces every signal.
+    /// Adds a channel to the sink for every signal.
     ///
     /// # Errors
     /// The sink's.
@@ -197,26 +197,26 @@ impl Taps {
         self.taps.iter_mut().try_for_each(|tap| tap.announce(sink))
     }
 
-    /// Passes on whatever has come; returns how many samples.
+    /// Passes on the samples that have arrived, and returns their number.
     ///
     /// # Errors
     /// [`RecordError::Bus`], and the sink's.
     pub fn drain(&mut self, sink: &mut dyn MessageSink) -> Result<u64, RecordError> {
         let Self { taps, grid, joined, last_tick, realtime } = self;
-        let mut desk = Desk { sink, grid: *grid, joined: *joined, last_tick: *last_tick, realtime: *realtime };
+        let mut context = TapContext { sink, grid: *grid, joined: *joined, last_tick: *last_tick, realtime: *realtime };
         let mut taken = 0;
         for tap in taps {
-            taken += tap.drain(&mut desk)?;
+            taken += tap.drain(&mut context)?;
         }
         Ok(taken)
     }
 
-    /// The tick of which not every signal is here yet.
+    /// Returns the first tick that some signal still lacks.
     pub fn next_tick(&self) -> u64 {
         self.taps.iter().map(|tap| tap.counters.next).min().unwrap_or(0)
     }
 
-    /// Closes every signal; gives services and what came of them.
+    /// Closes all signals and returns their services and counters.
     pub fn close(&mut self) -> Vec<(String, SignalCounters)> {
         let close = |tap: Tap| (tap.port.topic.to_string(), tap.counters);
         std::mem::take(&mut self.taps).into_iter().map(close).collect()

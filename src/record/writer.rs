@@ -1,9 +1,9 @@
-//! A recording as it is written: an MCAP file whose chunks are closed at a bounded age and size.
+//! Writes an MCAP file whose chunks are closed at a bounded age and size.
 //!
-//! Room for a chunk, and for the summary that ends the file, is asked for before the chunk is begun: a full disk is then
-//! noticed while the file can still be ended as it should. Where the system cannot promise room, what a failed write left
-//! is cut off, and the file ends with its last whole chunk. Every metadata record has a checksum of its own, since it is in no
-//! chunk, and a file that was cut off has none of the whole. Must not know samples.
+//! Space for a chunk and for the final summary is reserved before the chunk begins, so a full disk is noticed while the file
+//! can still be completed. On file systems without reservation, a failed write is cut off, and the file ends with its last
+//! whole chunk. Every metadata record has its own checksum: it is outside of the chunks, and a truncated file has no
+//! checksum over its whole. Must not interpret samples.
 
 use super::RecordError;
 use super::taps::{Channel, MessageSink};
@@ -24,7 +24,7 @@ use xxhash_rust::xxh3::Xxh3;
 /// The key of a metadata record's checksum.
 pub const CHECKSUM: &str = "checksum";
 
-/// The checksum of a metadata record: over its name and all of its other entries, each with its length before it.
+/// Returns the checksum of a metadata record, over its name and all other entries, each preceded by its length.
 pub fn checksum(name: &str, entries: &BTreeMap<String, String>) -> String {
     let mut hasher = Xxh3::new();
     let texts = entries.iter().flat_map(|(key, value)| [key.as_str(), value.as_str()]);
@@ -35,36 +35,37 @@ pub fn checksum(name: &str, entries: &BTreeMap<String, String>) -> String {
     format!("{:016x}", hasher.digest())
 }
 
-/// A chunk is closed when it holds so many bytes.
+/// Size at which a chunk is closed.
 const CHUNK_BYTES: usize = 256 << 10;
-/// A chunk is closed when it is so old, ns: so much a crash may lose.
+/// Age at which a chunk is closed, ns. A crash loses at most this much time.
 const CHUNK_NS: u64 = 500_000_000;
-/// The most that is written around a message's body: its header in the chunk and its entry in the index, bytes.
+/// Largest overhead of a message: its header in the chunk and its entry in the index, bytes.
 const MESSAGE_OVERHEAD: usize = 31 + 16;
-/// The least room kept for the end of the file: indexes, statistics, counters; bytes.
+/// Least space reserved for the end of the file: indexes, statistics, counters; bytes.
 const END_BYTES: u64 = 64 << 10;
-/// What the summary says of a chunk, and of each channel in it; bytes.
+/// Bytes in the summary per chunk.
 const CHUNK_INDEX_BYTES: u64 = 128;
+/// Bytes in the summary per chunk and channel.
 const CHANNEL_INDEX_BYTES: u64 = 32;
 
-/// A file that is being recorded to.
+/// A writer of a recording.
 pub struct Writer {
     mcap: Option<mcap::Writer<BufWriter<Sink>>>,
-    /// The same file, for what its writer cannot do.
+    /// The same file, to reserve space and to truncate.
     file: files::Created,
     path: PathBuf,
     channels: u64,
     chunks: u64,
-    /// Where the last whole chunk ends.
-    whole: u64,
+    /// Length of the file up to its last whole chunk.
+    whole_bytes: u64,
     pending: usize,
-    /// When the chunk at hand was begun, ns; none between two.
-    began_ns: Option<u64>,
+    /// Time at which the current chunk began, ns; `None` between chunks.
+    chunk_began_ns: Option<u64>,
     frame: Vec<u8>,
 }
 
 impl Writer {
-    /// Makes the file, or empties it.
+    /// Creates the file, or empties it.
     ///
     /// # Errors
     /// [`RecordError::Write`].
@@ -77,21 +78,22 @@ impl Writer {
             .library(concat!("corotate ", env!("CARGO_PKG_VERSION")))
             .compression(Some(mcap::Compression::Lz4))
             .chunk_size(None);
-        let mcap = options.create(BufWriter::with_capacity(64 << 10, sink)).map_err(|error| wrong(path, error))?;
+        let mcap =
+            options.create(BufWriter::with_capacity(64 << 10, sink)).map_err(|error| write_error(path, error))?;
         Ok(Self {
             mcap: Some(mcap),
             file,
             path: path.to_owned(),
             channels: 0,
             chunks: 0,
-            whole: 0,
+            whole_bytes: 0,
             pending: 0,
-            began_ns: None,
+            chunk_began_ns: None,
             frame: Vec::new(),
         })
     }
 
-    /// Writes what is known of the run, with its checksum, and closes the chunk at hand.
+    /// Writes a metadata record with its checksum, and closes the current chunk.
     ///
     /// # Errors
     /// [`RecordError::Write`].
@@ -102,39 +104,38 @@ impl Writer {
         self.close_chunk()
     }
 
-    /// Closes the chunk at hand if it is large or old enough.
+    /// Closes the current chunk if it is large or old enough.
     ///
     /// # Errors
     /// [`RecordError::Write`].
-    pub fn turn(&mut self, now_ns: u64) -> Result<(), RecordError> {
-        let old = self.began_ns.is_some_and(|began_ns| now_ns.saturating_sub(began_ns) >= CHUNK_NS);
+    pub fn close_due_chunk(&mut self, now_ns: u64) -> Result<(), RecordError> {
+        let old = self.chunk_began_ns.is_some_and(|began_ns| now_ns.saturating_sub(began_ns) >= CHUNK_NS);
         if old || self.pending >= CHUNK_BYTES { self.close_chunk() } else { Ok(()) }
     }
 
     fn close_chunk(&mut self) -> Result<(), RecordError> {
         self.attempt(mcap::Writer::flush)?;
-        (self.pending, self.began_ns) = (0, None);
+        (self.pending, self.chunk_began_ns) = (0, None);
         self.chunks += 1;
-        self.whole = (&*self.file).stream_position().map_err(|source| self.failed(source))?;
+        self.whole_bytes = (&*self.file).stream_position().map_err(|source| self.failed(source))?;
         Ok(())
     }
 
-    /// Asks for room for one more chunk and the end of the file.
-    fn reserve(&mut self, first: usize) -> Result<(), RecordError> {
+    /// Reserves space for one more chunk and the end of the file.
+    fn reserve(&mut self, sample_bytes: usize) -> Result<(), RecordError> {
         let end = END_BYTES + self.chunks * (CHUNK_INDEX_BYTES + CHANNEL_INDEX_BYTES * self.channels);
-        // What does not compress grows by a little, and the last sample may be beyond the size.
-        let chunk = (CHUNK_BYTES + CHUNK_BYTES / 4 + 2 * first) as u64;
-        match fallocate(self.file.as_fd(), FallocateFlags::KEEP_SIZE, self.whole, chunk + end) {
+        // Incompressible data grows slightly, and the last sample may exceed the chunk size.
+        let chunk = (CHUNK_BYTES + CHUNK_BYTES / 4 + 2 * sample_bytes) as u64;
+        match fallocate(self.file.as_fd(), FallocateFlags::KEEP_SIZE, self.whole_bytes, chunk + end) {
             Err(error @ (Errno::NOSPC | Errno::DQUOT | Errno::FBIG)) => {
                 Err(RecordError::Full { path: self.path.clone(), source: error.into() })
             }
-            // Not every file system can promise room.
+            // Not every file system supports reservation.
             _ => Ok(()),
         }
     }
 
-    /// Ends the file: closes the last chunk, and writes the summary by which readers find everything. Returns its length,
-    /// bytes.
+    /// Closes the last chunk and writes the summary with all indexes. Returns the length of the file, bytes.
     ///
     /// # Errors
     /// [`RecordError::Write`].
@@ -144,24 +145,26 @@ impl Writer {
             mcap.into_inner().into_inner().map_err(|error| self.failed(error.into_error()))?;
         }
         let length = (&*self.file).stream_position().map_err(|source| self.failed(source))?;
-        // Gives back the room that was not used.
+        // Releases the reserved space that is left.
         self.file.set_len(length).and_then(|()| self.file.sync_data()).map_err(|source| self.failed(source))?;
         Ok(length)
     }
 
-    /// Does something with the file; if that fails, leaves it with its last whole chunk as the end.
+    /// Performs a write; if that fails, truncates the file to its last whole chunk.
     fn attempt<T>(
         &mut self,
-        act: impl FnOnce(&mut mcap::Writer<BufWriter<Sink>>) -> Result<T, McapError>,
+        write: impl FnOnce(&mut mcap::Writer<BufWriter<Sink>>) -> Result<T, McapError>,
     ) -> Result<T, RecordError> {
-        let Some(mcap) = &mut self.mcap else { return Err(self.failed(io::Error::other("it has ended already"))) };
-        match act(mcap) {
-            Ok(done) => Ok(done),
+        let Some(mcap) = &mut self.mcap else {
+            return Err(self.failed(io::Error::other("the file is already closed")));
+        };
+        match write(mcap) {
+            Ok(written) => Ok(written),
             Err(error) => {
-                // Its end must not be written behind the cut: the sink takes nothing any more once it has failed.
+                // Dropping the writer must not append a footer: the sink refuses all writes once one has failed.
                 self.mcap = None;
-                let _ = self.file.set_len(self.whole);
-                Err(wrong(&self.path, error))
+                let _ = self.file.set_len(self.whole_bytes);
+                Err(write_error(&self.path, error))
             }
         }
     }
@@ -186,7 +189,7 @@ impl MessageSink for Writer {
         })
     }
 
-    /// After an error for want of room the file can still be finished.
+    /// Writes a message. After [`RecordError::Full`] the file can still be finished.
     fn message(
         &mut self,
         channel_id: Channel,
@@ -195,9 +198,9 @@ impl MessageSink for Writer {
         logged_ns: u64,
         body: &[u8],
     ) -> Result<(), RecordError> {
-        if self.began_ns.is_none() {
+        if self.chunk_began_ns.is_none() {
             self.reserve(body.len())?;
-            self.began_ns = Some(monotonic_ns());
+            self.chunk_began_ns = Some(monotonic_ns());
         }
         frame(body, &mut self.frame);
         self.pending += self.frame.len() + MESSAGE_OVERHEAD;
@@ -210,15 +213,15 @@ impl MessageSink for Writer {
     }
 }
 
-fn wrong(path: &Path, error: McapError) -> RecordError {
+fn write_error(path: &Path, error: McapError) -> RecordError {
     let source = match error {
         McapError::Io(source) => source,
-        other => io::Error::other(other),
+        error => io::Error::other(error),
     };
     RecordError::Write { path: path.to_owned(), source }
 }
 
-/// The file behind the writer. After a failure it takes nothing any more.
+/// The file behind the writer. Refuses all writes after a failed one.
 struct Sink {
     file: File,
     broken: bool,

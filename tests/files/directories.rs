@@ -1,4 +1,4 @@
-//! Where results go, and by which names a run is found again.
+//! Directories of results, and the names by which a run is found.
 
 use crate::common::{Bench, Done, await_some};
 use libc::SIGTERM;
@@ -19,7 +19,7 @@ fn run_of(bench: &Bench, out: &str) -> String {
 }
 
 #[test]
-fn a_live_run_keeps_others_out_of_its_directory() {
+fn a_directory_in_use_by_a_run_is_refused_to_another() {
     for clock in ["lockstep", "in-process"] {
         let bench = Bench::new();
         let endless = ["run", "rigid-pair", "--clock", clock, "--duration=100000", "--set=accept={}", "--out", "out"];
@@ -38,7 +38,7 @@ fn a_live_run_keeps_others_out_of_its_directory() {
 }
 
 #[test]
-fn an_earlier_run_is_kept_unless_it_is_to_be_overwritten() {
+fn results_are_replaced_only_with_overwrite() {
     let bench = Bench::new();
     fs::create_dir(bench.path("out")).unwrap();
     fs::write(bench.path("out/notes.txt"), "mine").unwrap();
@@ -48,14 +48,14 @@ fn an_earlier_run_is_kept_unless_it_is_to_be_overwritten() {
     assert_eq!(short(&bench, "out", &[]).code, Some(2));
     assert_eq!(run_of(&bench, "out"), first);
     assert!(bench.path("out/run.mcap").exists() && bench.path("out/report.html").exists());
-    // Of a run that was killed there may be no more than its recording.
+    // A killed run may have left only its recording.
     fs::remove_file(bench.path("out/summary.json")).unwrap();
     assert_eq!(short(&bench, "out", &[]).code, Some(2));
     let over = short(&bench, "out", &["--overwrite"]).succeeded();
     assert!(over.stderr.contains("run.mcap") && over.stderr.contains("report.html"), "{over:?}");
     assert!(!bench.path("out/run.mcap").exists() && !bench.path("out/report.html").exists());
     assert_eq!(fs::read(bench.path("out/notes.txt")).unwrap(), b"mine");
-    // A campaign's directory is no run's.
+    // A campaign's directory is never overwritten by a run.
     for name in ["campaign.toml", "journal"] {
         fs::create_dir_all(bench.path("map")).unwrap();
         fs::write(bench.path("map").join(name), "").unwrap();
@@ -64,24 +64,23 @@ fn an_earlier_run_is_kept_unless_it_is_to_be_overwritten() {
 }
 
 #[test]
-fn a_run_has_the_same_names_for_every_command() {
+fn every_command_finds_a_run_by_the_same_names() {
     let bench = Bench::new();
     let record = |name: &str| short(&bench, &format!("runs/{name}"), &["--record"]);
     assert_eq!(record("pair").code, Some(0));
     let alone = bench.run(&["diff", "runs/pair"]);
-    assert_eq!(alone.code, Some(2), "there is no other recording: {alone:?}");
+    assert_eq!(alone.code, Some(2), "only one run has a recording: {alone:?}");
     assert_eq!(record("again").code, Some(0));
     // The newest run has no recording.
     assert_eq!(short(&bench, "runs/bare", &[]).code, Some(0));
     let diff = bench.run(&["diff", "runs/pair", "--json"]).succeeded();
-    let told = diff.json();
-    assert_eq!(told["b"], "runs/again/run.mcap");
+    assert_eq!(diff.json()["b"], "runs/again/run.mcap");
     let replay = bench.run(&["replay", "latest"]);
     assert!(replay.code == Some(2) && replay.stderr.contains("runs/again"), "{replay:?}");
     for run in ["runs/pair", "runs/pair/run.mcap", "runs/latest", "latest"] {
         assert_eq!(bench.run(&["report", run, "--out", "page.html"]).code, Some(0), "{run}");
     }
-    // A run under way, by each of its names: the bridge gets as far as its line.
+    // A live run by each of its names: the bridge fails only when it opens the line.
     let words = ["run", "rigid-pair", "--external", "follower", "--duration=100000", "--set=accept={}", "--record"];
     let running = bench.start(&[&words[..], &["--out", "runs/live", "--clock", "lockstep"]].concat());
     bench.await_role("leader");
@@ -102,9 +101,9 @@ fn a_run_has_the_same_names_for_every_command() {
     running.wait();
 }
 
-/// A pipe that is closed before anything is read, as by `| head -0`.
+/// The pipe is closed before anything is read, as by `| head -0`.
 #[test]
-fn a_reader_that_is_gone_changes_neither_results_nor_exit_code() {
+fn a_closed_stdout_changes_neither_results_nor_exit_code() {
     let bench = Bench::new();
     let into_closed_pipe = |arguments: &[&str]| {
         let (reader, writer) = std::io::pipe().unwrap();
@@ -122,9 +121,9 @@ fn a_reader_that_is_gone_changes_neither_results_nor_exit_code() {
     }
 }
 
-/// Opened as a file is, a FIFO waits for its other end, deaf to every signal.
+/// Opening a FIFO like a file blocks until its other end is opened.
 #[test]
-fn what_is_no_regular_file_keeps_nothing_waiting() {
+fn a_fifo_in_place_of_a_file_does_not_block() {
     let bench = Bench::new();
     let base = bench.runtime().join("corotate");
     fs::create_dir(&base).unwrap();

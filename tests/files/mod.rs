@@ -1,4 +1,4 @@
-//! Reads what the program writes, with foreign readers where there are any, and gives it foreign and damaged files to read.
+//! Files that the program writes, read by independent readers; and foreign and damaged files, read by the program.
 
 mod damage;
 mod directories;

@@ -1,4 +1,4 @@
-//! Recordings: what is in them beside what was published, read by programs that share no code with ours; replayed; cut off.
+//! Recordings, read by independent programs and compared with what was published; replayed; cut off.
 
 use crate::common::{Bench, Done, await_some, python, rewrite, rewrite_metadata, root, send_signal, shipped, skipped};
 use corotate::bus::Reader;
@@ -17,7 +17,7 @@ use libc::{SIGCONT, SIGKILL, SIGSTOP};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Runs a shipped scenario with a recording; gives the run's end and the recording.
+/// Runs a shipped scenario with a recording. Returns the ended program and the file.
 fn record(bench: &Bench, scenario: &str, out: &str, arguments: &[&str]) -> (Done, PathBuf) {
     let file = shipped(scenario);
     let common = ["run", file.to_str().unwrap(), "--record", "--overwrite", "--out", out, "--set", "accept={}"];
@@ -28,7 +28,7 @@ fn replay(bench: &Bench, file: &Path, options: &[&str]) -> Done {
     bench.run(&[&["replay", file.to_str().unwrap()], options].concat())
 }
 
-/// Everything that is published in a run in this thread, byte by byte, by service; no recorder takes part.
+/// Runs a scenario in this thread without a recorder, and returns all published bytes by service.
 fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
     let bus = MemoryBus::new(depths(scenario));
     let roles = RoleId::all(scenario);
@@ -57,7 +57,7 @@ fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
 }
 
 #[test]
-fn foreign_readers_decode_every_field_of_every_sample_as_it_was_published() {
+fn independent_readers_decode_every_sample_as_it_was_published() {
     let (bench, python) = (Bench::new(), python("readers"));
     for (scenario, clock) in [("rigid-pair", "lockstep"), ("orbit-rendezvous", "in-process"), ("gyro-loss", "lockstep")]
     {
@@ -77,12 +77,12 @@ fn foreign_readers_decode_every_field_of_every_sample_as_it_was_published() {
                 assert!(std::fs::read(&path).unwrap() == *bytes, "{scenario}: {service} by {reader}");
             }
         }
-        assert_eq!(std::fs::read_dir(&decoded).unwrap().count(), 2 * published.len(), "no signal beside those");
+        assert_eq!(std::fs::read_dir(&decoded).unwrap().count(), 2 * published.len(), "no further signals");
     }
 }
 
 #[test]
-fn every_clock_is_recorded_completely_and_replayed_to_the_last_bit() {
+fn a_run_by_every_clock_is_recorded_completely_and_replayed_to_the_last_bit() {
     let bench = Bench::new();
     for clock in ["in-process", "lockstep", "realtime"] {
         let (done, file) = record(&bench, "rigid-pair", clock, &["--clock", clock, "--duration", "1"]);
@@ -93,21 +93,23 @@ fn every_clock_is_recorded_completely_and_replayed_to_the_last_bit() {
             assert_eq!(signal["recorded"], signal["published"], "{signal}");
         }
         for options in [&[][..], &["--processes"]] {
-            let done = replay(&bench, &file, options);
+            let done = replay(&bench, &file, &[options, &["--json"]].concat());
             assert_eq!(done.code, Some(0), "{clock} {options:?}: {done:?}");
-            assert_eq!(done.stdout.matches("the same to the last bit").count(), 4, "{done:?}");
+            let replayed = done.json();
+            let roles = replayed["roles"].as_array().unwrap();
+            assert!(roles.len() == 4 && roles.iter().all(|role| role["same"] == true), "{replayed}");
         }
     }
-    let [one, other] = ["in-process", "lockstep"].map(|clock| bench.path(clock).join("run.mcap"));
-    bench.run(&["diff", one.to_str().unwrap(), other.to_str().unwrap()]).succeeded();
-    let recording = Recording::open(&one).unwrap();
+    let [in_process, lockstep] = ["in-process", "lockstep"].map(|clock| bench.path(clock).join("run.mcap"));
+    bench.run(&["diff", in_process.to_str().unwrap(), lockstep.to_str().unwrap()]).succeeded();
+    let recording = Recording::open(&in_process).unwrap();
     assert_eq!((recording.signals().len(), recording.damage()), (6, None));
     assert_eq!((recording.info().seed, recording.info().whole), (1, true));
     let track = recording.tracks(|info| info.signal == "estimate").unwrap().swap_remove(0);
     assert_eq!(track.ticks(), (0..=1000).collect::<Vec<_>>());
     assert_eq!(track.column("omega_rad_s", 0).unwrap()[0], 0.6);
     assert!(track.column("omega_rad_s", 3).is_none());
-    bench.run(&["export", one.to_str().unwrap(), "--csv", "tables"]).succeeded();
+    bench.run(&["export", in_process.to_str().unwrap(), "--csv", "tables"]).succeeded();
     let table = std::fs::read_to_string(bench.path("tables/leader.estimate.csv")).unwrap();
     let row: Vec<&str> = table.lines().nth(501).unwrap().split(',').collect();
     let value: f64 = row[8].parse().unwrap();
@@ -115,11 +117,11 @@ fn every_clock_is_recorded_completely_and_replayed_to_the_last_bit() {
 }
 
 #[test]
-fn faults_and_deaths_are_replayed_as_they_were() {
+fn runs_with_faults_and_killed_roles_are_replayed_exactly() {
     let bench = Bench::new();
     for role in ["leader", "follower", "observer", "controller"] {
         let fault = format!("fault=[{{kind=\"kill\",role=\"{role}\",from_tick=400}}]");
-        // In real time the successor has seconds to come, and a recorder that was held up loses samples and says so.
+        // In real time the successor has seconds to start, and a delayed recorder reports lost samples.
         for (clock, duration) in [("in-process", "1"), ("lockstep", "1"), ("realtime", "5")] {
             let out = format!("{role}-{clock}");
             let options = ["--clock", clock, "--duration", duration, "--set", &fault];
@@ -146,20 +148,20 @@ fn faults_and_deaths_are_replayed_as_they_were() {
         let (done, file) = record(&bench, scenario, &out, &[&["--clock", clock], &duration[..]].concat());
         assert_eq!(done.code, Some(0), "{done:?}");
         for options in [&[][..], &["--processes"]] {
-            let done = replay(&bench, &file, options);
-            assert_eq!(done.code, Some(0), "{clock} {options:?}: {done:?}");
-            assert!(!done.stdout.contains("nothing can be"), "{done:?}");
+            let replayed = replay(&bench, &file, &[options, &["--json"]].concat()).succeeded().json();
+            let roles = replayed["roles"].as_array().unwrap();
+            assert!(roles.iter().all(|role| role["limit"].is_null()), "{clock} {options:?}: {replayed}");
         }
     }
 }
 
 #[test]
-fn one_bit_is_found_wherever_it_is_and_another_layout_is_refused() {
+fn a_changed_bit_is_found_and_a_different_layout_is_refused() {
     let bench = Bench::new();
     let (done, file) = record(&bench, "rigid-pair", "out", &["--clock", "lockstep", "--duration", "1"]);
     assert_eq!(done.code, Some(0), "{done:?}");
     let changed = bench.path("changed.mcap");
-    // The last bit of the third component of the estimate: behind the CDR header, the stamp and two components.
+    // The last bit of the estimate's third component: after the CDR header, the stamp and two components.
     let flip = |at: usize, topic: &'static str, tick: u32| {
         rewrite(
             &file,
@@ -176,18 +178,18 @@ fn one_bit_is_found_wherever_it_is_and_another_layout_is_refused() {
     for options in [&["--role", "observer"][..], &["--role", "observer", "--processes"], &[]] {
         let done = replay(&bench, &changed, options);
         assert_eq!(done.code, Some(3), "{done:?}");
-        let words = "tick 700, corotate/rigid-pair/leader/estimate omega_rad_s[2]:\n  recorded ";
-        assert!(done.stdout.contains(words) && done.stdout.contains("\n  replayed "), "{done:?}");
+        let place = "tick 700, corotate/rigid-pair/leader/estimate omega_rad_s[2]:\n  recorded ";
+        assert!(done.stdout.contains(place) && done.stdout.contains("\n  replayed "), "{done:?}");
     }
     let done = bench.run(&["diff", file.to_str().unwrap(), changed.to_str().unwrap()]);
     assert!(done.code == Some(3) && done.stdout.contains("tick 700, leader/estimate omega_rad_s[2]"), "{done:?}");
     let tolerant = ["diff", file.to_str().unwrap(), changed.to_str().unwrap(), "--relative", "1e-12"];
     assert_eq!(bench.run(&tolerant).code, Some(0));
-    // An input: what the observer makes of it differs from then on.
+    // A changed input changes the observer's output from that tick on.
     flip(4 + 32, "/corotate/rigid_pair/leader/measurement", 500);
     let done = replay(&bench, &changed, &["--role", "observer"]);
     assert!(done.code == Some(3) && done.stdout.contains("at tick 500, "), "{done:?}");
-    // The last sample is compared, too.
+    // The last sample is compared too.
     flip(4 + 32, "/corotate/rigid_pair/follower/command", 1000);
     let done = replay(&bench, &changed, &["--role", "controller"]);
     assert!(done.code == Some(3) && done.stdout.contains("tick 1000, "), "{done:?}");
@@ -207,7 +209,7 @@ fn one_bit_is_found_wherever_it_is_and_another_layout_is_refused() {
 }
 
 #[test]
-fn a_file_that_was_cut_off_is_read_as_far_as_it_goes_and_no_file_is_believed() {
+fn a_truncated_file_is_read_in_part_and_an_oversized_schema_is_refused() {
     let bench = Bench::new();
     let (done, file) = record(&bench, "rigid-pair", "out", &["--clock", "in-process", "--duration", "2"]);
     assert_eq!(done.code, Some(0), "{done:?}");
@@ -218,20 +220,20 @@ fn a_file_that_was_cut_off_is_read_as_far_as_it_goes_and_no_file_is_believed() {
         std::fs::write(&cut, &bytes[..bytes.len() * part / 12]).unwrap();
         let done = replay(&bench, &cut, &["--accept-incomplete"]);
         let readable = done.code == Some(0) && done.says("incomplete-recording");
-        assert!(readable || (done.code == Some(2) && done.stderr.contains("no recording")), "{part}: {done:?}");
+        assert!(readable || (done.code == Some(2) && done.says("not-a-recording")), "{part}: {done:?}");
         replayed += u32::from(readable);
     }
     assert!(replayed >= 8, "{replayed}");
-    // No sample is so long, and nobody is to make as many columns.
+    // A sample of this length, or a table with as many columns, would exhaust the memory.
     let long = |schema: String| schema.replace("float64[3] ", "float64[1000000000000] ");
     rewrite(&file, &cut, long, |_, _, _| {});
     let done = bench.run(&["export", cut.to_str().unwrap(), "--csv", "tables"]);
-    assert!(done.code == Some(1) && done.stderr.contains("has no samples of ours"), "{done:?}");
+    assert!(done.code == Some(1) && done.says("damaged-recording"), "{done:?}");
 }
 
-/// Where files have a limit, which any user can have, as where the disk is full.
+/// A limit on file sizes acts like a full disk, and any user can set it.
 #[test]
-fn without_room_the_recording_ends_readable_and_the_loop_goes_on() {
+fn at_a_file_size_limit_the_recording_stays_readable_and_the_loop_continues() {
     let bench = Bench::new();
     for clock in ["in-process", "lockstep"] {
         let program = bench.command().get_program().to_owned();
@@ -256,9 +258,9 @@ fn without_room_the_recording_ends_readable_and_the_loop_goes_on() {
     }
 }
 
-/// A disk of its own, where this user may make one: then the file has its index, because room for it was kept.
+/// Needs a user that may mount a file system. The file has its index, because space for it was reserved.
 #[test]
-fn on_a_full_disk_the_recording_has_an_end() {
+fn on_a_full_disk_the_recording_is_completed_with_an_index() {
     let bench = Bench::new();
     std::fs::create_dir(bench.path("small")).unwrap();
     let program = bench.command().get_program().to_owned();
@@ -271,21 +273,23 @@ fn on_a_full_disk_the_recording_has_an_end() {
     let options = ["--user", "--map-root-user", "--mount", "bash", "-c", &script];
     let done = bench.start_program(Path::new("unshare"), &options).wait();
     if done.code == Some(77) || done.stderr.contains("unshare failed") {
-        return skipped("a recording on a full disk", "this user may not mount a disk of its own");
+        return skipped("a recording on a full disk", "this user may not mount a file system");
     }
-    assert!(done.code == Some(1) && done.stderr.contains("the disk is full"), "{done:?}");
+    // ENOSPC.
+    let error = "(os error 28)";
+    assert!(done.code == Some(1) && done.says("incomplete-recording") && done.stderr.contains(error), "{done:?}");
     let recording = Recording::open(&bench.path("kept.mcap")).unwrap();
     assert_eq!(recording.damage(), None);
     let end = recording.info().end.as_ref().unwrap();
-    assert!(!end.complete && end.problem.contains("the disk is full"), "{}", end.problem);
+    assert!(!end.complete && end.problem.contains(error), "{}", end.problem);
     assert!(mcap::Summary::read(&std::fs::read(bench.path("kept.mcap")).unwrap()).unwrap().is_some());
     let done = replay(&bench, &bench.path("kept.mcap"), &["--accept-incomplete"]);
-    assert!(done.code == Some(0) && done.stderr.contains("the disk is full"), "{done:?}");
+    assert!(done.code == Some(0) && done.stderr.contains(error), "{done:?}");
 }
 
-/// A recorder that ends amid a tick has one of a role's samples and not the other.
+/// A recorder that ends within a tick has some of a role's samples of it, and lacks others.
 #[test]
-fn what_a_recording_that_ended_early_has_not_is_no_difference() {
+fn samples_after_an_early_end_of_the_recording_are_not_differences() {
     let bench = Bench::new();
     let (done, file) = record(&bench, "rigid-pair", "out", &["--clock", "lockstep", "--duration", "1"]);
     assert_eq!(done.code, Some(0), "{done:?}");
@@ -296,19 +300,20 @@ fn what_a_recording_that_ended_early_has_not_is_no_difference() {
         }
     };
     rewrite(&file, &cut, |schema| schema, truth);
-    assert_eq!(replay(&bench, &cut, &[]).code, Some(3), "it says that it is complete");
+    assert_eq!(replay(&bench, &cut, &[]).code, Some(3), "the file is marked complete");
     rewrite_metadata(&cut, &ended, |name, entries| {
         if name == "corotate.end" {
             entries.insert("complete".to_owned(), "false".to_owned());
             entries.insert("problem".to_owned(), "the disk is full".to_owned());
         }
     });
-    let done = replay(&bench, &ended, &["--accept-incomplete"]).succeeded();
-    assert!(done.stdout.contains("from tick 1000 on nothing can be compared: the recording ended there"), "{done:?}");
+    let replayed = replay(&bench, &ended, &["--accept-incomplete", "--json"]).succeeded().json();
+    let roles = replayed["roles"].as_array().unwrap();
+    assert!(roles.iter().any(|role| role["limit"]["tick"] == 1000), "{replayed}");
 }
 
 #[test]
-fn a_recorder_that_dies_or_hangs_holds_nobody_up_and_leaves_what_it_had() {
+fn a_killed_or_stopped_recorder_does_not_delay_the_run_and_leaves_a_readable_file() {
     let bench = Bench::new();
     for (clock, signal, ticks) in
         [("realtime", SIGKILL, 8000), ("lockstep", SIGKILL, 60_000), ("lockstep", SIGSTOP, 60_000)]
@@ -321,7 +326,7 @@ fn a_recorder_that_dies_or_hangs_holds_nobody_up_and_leaves_what_it_had() {
         let running = bench.start(&[&fixed[..], &["--clock", clock, "--duration", &duration]].concat());
         let domain = await_some(|| bench.domains().pop());
         let file = bench.path(&out).join("run.mcap");
-        // Under way: there is more than the head of the file.
+        // The recorder has written samples.
         await_some(|| std::fs::metadata(&file).ok().filter(|file| file.len() > 100_000));
         let recorder = bench.await_role("record");
         send_signal(recorder, signal);
@@ -339,9 +344,9 @@ fn a_recorder_that_dies_or_hangs_holds_nobody_up_and_leaves_what_it_had() {
     }
 }
 
-/// As a busy disk keeps it: more than 5 s, in which it would be given up were it a role.
+/// Like on a busy disk. A role would be given up after 5 s.
 #[test]
-fn a_recorder_that_is_long_about_its_end_is_waited_for() {
+fn a_recorder_that_ends_slowly_is_waited_for() {
     let bench = Bench::new();
     let words = ["run", "rigid-pair", "--record", "--clock", "realtime", "--duration", "2", "--out", "out"];
     let patient = ["--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=60"];
@@ -354,16 +359,16 @@ fn a_recorder_that_is_long_about_its_end_is_waited_for() {
     std::thread::sleep(std::time::Duration::from_secs(7));
     send_signal(recorder, SIGCONT);
     let done = running.wait();
-    // What it could not take while it stood still is lost and told; what it had is in the file, with its end.
+    // Samples sent while it was stopped are lost and reported; the others are in the file, which has its end.
     let recording = &bench.summary_in("out")["recording"];
     assert!(recording["messages"].as_u64().unwrap() > 0, "{recording}: {done:?}");
     assert!(recording["bytes"].as_u64().unwrap() > 0, "{recording}: {done:?}");
     bench.assert_clean(&[domain]);
 }
 
-/// Nothing is sent to whoever joins then, and the loop must not wait for it to take something.
+/// No sample is sent until the launcher gives credit, and the launcher must not wait for the recorder to take one.
 #[test]
-fn a_recorder_that_joins_a_loop_that_waits_for_credit_does_not_stop_it() {
+fn a_recorder_that_joins_while_the_loop_waits_for_credit_does_not_block_it() {
     let bench = Bench::new();
     let words = ["run", "rigid-pair", "--clock", "lockstep", "--duration", "20", "--set", "accept={}", "--out", "out"];
     let running = bench.start(&words);
@@ -377,7 +382,7 @@ fn a_recorder_that_joins_a_loop_that_waits_for_credit_does_not_stop_it() {
         (before == commits).then_some(())
     });
     let recorder = bench.start(&["record", "--domain", domain.to_str().unwrap(), "--out", "part.mcap"]);
-    // Every signal is open before there is a file; its first word follows at once.
+    // The recorder opens all signals before the file, and publishes its first heartbeat right after.
     await_some(|| std::fs::metadata(bench.path("part.mcap")).ok());
     std::thread::sleep(std::time::Duration::from_millis(200));
     running.signal(SIGCONT);
@@ -386,7 +391,7 @@ fn a_recorder_that_joins_a_loop_that_waits_for_credit_does_not_stop_it() {
     bench.assert_clean(&[domain]);
 }
 
-/// All that a run shares lies in files that begin with its domain's name.
+/// Returns the size of a run's shared memory: the files that begin with its domain's name.
 fn shared_bytes(domain: &Path) -> u64 {
     use std::os::unix::fs::MetadataExt;
     let name = format!("corotate_{}_", domain.file_name().unwrap().to_str().unwrap());
@@ -396,15 +401,15 @@ fn shared_bytes(domain: &Path) -> u64 {
 }
 
 #[test]
-fn a_recorder_beside_a_running_loop_takes_everything_from_then_on_within_four_mebibytes() {
+fn a_recorder_that_joins_late_takes_all_later_samples_within_four_mebibytes() {
     let bench = Bench::new();
     for (clock, seconds) in [("realtime", "6"), ("lockstep", "60")] {
         let scenario = shipped("rigid-pair");
         let fixed = ["run", scenario.to_str().unwrap(), "--out", clock, "--set", "accept={}", "--clock", clock];
         let running = bench.start(&[&fixed[..], &["--duration", seconds]].concat());
         let domain = await_some(|| bench.domains().pop());
-        // The watcher sees a tick; it is gone again before the recorder comes. In a thread of its own: it gives way to
-        // everybody, and what is started from its thread would too.
+        // Waits for a tick with a watcher, which ends before the recorder starts. The watcher lowers the priority of its
+        // thread, and the recorder must not inherit that.
         let watch = || {
             await_some(|| {
                 let mut session = Session::open(Some(&domain), || false).ok()?;
@@ -426,20 +431,20 @@ fn a_recorder_beside_a_running_loop_takes_everything_from_then_on_within_four_me
         let recording = Recording::open(&bench.path(&file)).unwrap();
         let end = recording.info().end.as_ref().unwrap();
         assert!(!recording.info().whole && !end.complete && recorded.code == Some(0), "{recorded:?}");
-        assert!(recorded.stdout.contains("from the midst of the run on"), "{recorded:?}");
         let track = recording.tracks(|info| info.signal == "truth").unwrap().swap_remove(0);
         let ticks = track.ticks();
         if clock == "lockstep" {
             assert!(ticks.windows(2).all(|pair| pair[0] + 1 == pair[1]), "lockstep loses nothing");
         }
         assert!(ticks.last().is_some_and(|tick| *tick == recording.info().last_tick), "{:?}", ticks.last());
-        let done = replay(&bench, &bench.path(&file), &["--accept-incomplete"]);
-        assert!(done.code == Some(0) && done.stdout.contains("in the midst of the run"), "{done:?}");
+        let replayed = replay(&bench, &bench.path(&file), &["--accept-incomplete", "--json"]).succeeded().json();
+        let roles = replayed["roles"].as_array().unwrap();
+        assert!(roles.iter().all(|role| role["limit"]["tick"] == 0), "{replayed}");
         bench.assert_clean(&[domain]);
     }
 }
 
-/// Numbers that look random, the same in every run.
+/// Reproducible random numbers.
 struct Random(u64);
 
 impl Random {
@@ -451,19 +456,21 @@ impl Random {
         (z ^ z >> 31) % end
     }
 
+    /// Returns true with the probability 1 / `count`.
     fn one_in(&mut self, count: u64) -> bool {
         self.below(count) == 0
     }
 
-    /// Ticks that a role stands still; one in so many is longer than links are deep in a replay.
+    /// Returns the ticks that a role pauses. Once in `long` calls it may exceed the depth of the links in a replay.
     fn pause(&mut self, long: u64) -> u64 {
-        let most = if self.one_in(long) { 300 } else { 8 };
-        self.below(most)
+        let end = if self.one_in(long) { 300 } else { 8 };
+        self.below(end)
     }
 }
 
-/// A run in real time whose schedule the test decides: real nodes, recorded, in one thread. All ticks are due already, so no
-/// node waits for the time and nothing depends on the machine.
+/// A recorded run in real time with real nodes in one thread, scheduled by the test.
+///
+/// All ticks are due from the start, so no node waits, and nothing depends on the machine.
 struct Scheduled<'a> {
     scenario: &'a Scenario,
     bus: &'a MemoryBus,
@@ -491,7 +498,7 @@ impl<'a> Scheduled<'a> {
         run
     }
 
-    /// A role takes its seat, and executes no tick before this one.
+    /// Starts a role, or its successor, which executes no tick before this one.
     fn begin(&mut self, index: usize, first_tick: u64) {
         let (scenario, role, bus, ledger) = (self.scenario, self.roles[index], self.bus, &self.ledgers[index]);
         let mut node = build(scenario, role, bus, ledger).unwrap();
@@ -501,14 +508,14 @@ impl<'a> Scheduled<'a> {
         self.nodes[index] = Some(node);
     }
 
-    /// A role dies without a word.
-    fn die(&mut self, index: usize) {
+    /// Drops a role without finishing it.
+    fn kill(&mut self, index: usize) {
         self.nodes[index] = None;
     }
 
-    /// One look of a role at its inputs, at a tick; whether it executed.
-    fn look(&mut self, index: usize, tick: u64, overdue: bool) -> bool {
-        let gate = match (self.roles[index], overdue) {
+    /// Polls a role at a tick. Returns true if it executed, without finishing the tick.
+    fn poll(&mut self, index: usize, tick: u64, overdue: bool) -> bool {
+        let condition = match (self.roles[index], overdue) {
             (RoleId::Plant(_), _) => RunCondition::Now { tick, now_ns: self.grid.due_ns(tick) },
             (_, true) => RunCondition::Overdue,
             (_, false) => RunCondition::Arrived,
@@ -517,25 +524,23 @@ impl<'a> Scheduled<'a> {
         if node.next_tick() > tick {
             return false;
         }
-        node.poll(gate).unwrap() == Poll::Executed
+        node.poll(condition).unwrap() == Poll::Executed
     }
 
-    fn settle(&mut self, index: usize) {
+    fn finish_tick(&mut self, index: usize) {
         if let Some(node) = &mut self.nodes[index] {
             node.finish_tick().unwrap();
         }
     }
 
-    /// One look, and what an executed tick leaves to be done.
-    fn turn(&mut self, index: usize, tick: u64, overdue: bool) -> bool {
-        let executed = self.look(index, tick, overdue);
-        if executed {
-            self.settle(index);
+    /// Polls a role, and finishes the tick if it executed.
+    fn execute(&mut self, index: usize, tick: u64) {
+        if self.poll(index, tick, false) {
+            self.finish_tick(index);
         }
-        executed
     }
 
-    /// The recording takes what has come.
+    /// Records the samples that have arrived.
     fn record(&mut self) {
         self.recorder.poll().unwrap();
     }
@@ -543,8 +548,8 @@ impl<'a> Scheduled<'a> {
     fn finish(mut self) {
         self.nodes.iter_mut().flatten().for_each(|node| node.finish().unwrap());
         self.record();
-        let of = |(role, ledger)| report(self.scenario, role, ledger, Vec::new(), Vec::new());
-        let reports: Vec<_> = self.roles.into_iter().zip(&self.ledgers).map(of).collect();
+        let role_report = |(role, ledger)| report(self.scenario, role, ledger, Vec::new(), Vec::new());
+        let reports: Vec<_> = self.roles.into_iter().zip(&self.ledgers).map(role_report).collect();
         let report = self.recorder.finish(&reports, None);
         assert!(report.complete, "{report:?}");
     }
@@ -563,7 +568,7 @@ fn scenario_in_real_time(name: &str, ticks: u64, overrides: &[&str]) -> Scenario
     Scenario::load(&shipped(name), &overrides).unwrap()
 }
 
-/// A run on a machine that is busy with something else: roles look seldom and in any order, stand still, and die.
+/// Runs as on a busy machine: polls roles rarely and in random order, pauses and kills them.
 fn run_at_random(scenario: &Scenario, file: &Path, random: &mut Random, deaths: bool) {
     let bus = MemoryBus::new(depths(scenario));
     let mut run = Scheduled::new(scenario, &bus, file);
@@ -580,15 +585,15 @@ fn run_at_random(scenario: &Scenario, file: &Path, random: &mut Random, deaths: 
         for _ in 0..3 * run.roles.len() {
             let index = random.below(run.roles.len() as u64) as usize;
             let overdue = random.one_in(2);
-            if held_until[index] > tick || !run.look(index, tick, overdue) {
+            if held_until[index] > tick || !run.poll(index, tick, overdue) {
                 continue;
             }
             let dies = deaths && random.one_in(150);
             if !dies || random.one_in(2) {
-                run.settle(index);
+                run.finish_tick(index);
             }
             if dies {
-                run.die(index);
+                run.kill(index);
                 held_until[index] = tick + 1 + random.pause(2);
             }
         }
@@ -598,7 +603,7 @@ fn run_at_random(scenario: &Scenario, file: &Path, random: &mut Random, deaths: 
 }
 
 #[test]
-fn whatever_a_loaded_machine_made_of_a_run_is_replayed() {
+fn runs_under_any_load_are_replayed_without_difference() {
     let bench = Bench::new();
     let file = bench.path("run.mcap");
     let faults = "fault=[{kind=\"noise-burst\",role=\"leader\",deviation=0.3,from_tick=200,ticks=50,probability=0.5},\
@@ -609,23 +614,23 @@ fn whatever_a_loaded_machine_made_of_a_run_is_replayed() {
         [("rigid-pair", &[][..], false), ("rigid-trio", &[], true), ("rigid-pair", &[faults], true)]
     {
         let scenario = scenario_in_real_time(name, 1000, overrides);
-        let mut told = 0;
+        let mut complete = 0;
         for seed in 0..30 {
             run_at_random(&scenario, &file, &mut Random(seed), seed % 2 == 1);
             for replay in replays(&file) {
                 println!("{name} {seed} {replay:?}");
                 assert_eq!(replay.difference, None, "{name}, seed {seed}: {}, {} lives", replay.role, replay.lives);
                 assert!(limited || seed % 2 == 1 || replay.limit.is_none(), "{name}, seed {seed}: {replay:?}");
-                told += u64::from(replay.limit.is_none());
+                complete += u64::from(replay.limit.is_none());
             }
         }
-        assert!(told > 50, "{name}: {told} of 120 and more to their end");
+        assert!(complete > 50, "{name}: {complete} of at least 120 replays are complete");
     }
 }
 
-/// Samples that a fault keeps back do not tell that they were made; the counters of a role that missed none do.
+/// A withheld sample does not show whether its tick was executed. The final counters do, if the role missed no tick then.
 #[test]
-fn what_neither_samples_nor_counters_tell_is_not_claimed() {
+fn a_replay_is_limited_where_neither_samples_nor_counters_show_what_was_executed() {
     let bench = Bench::new();
     let file = bench.path("run.mcap");
     let fault = "fault=[{kind=\"drop\",role=\"observer\",from_tick=300,ticks=100}]";
@@ -636,7 +641,7 @@ fn what_neither_samples_nor_counters_tell_is_not_claimed() {
         for tick in 0..=scenario.last_tick {
             for index in 0..4 {
                 if run.roles[index] != RoleId::Observer || !held.contains(&tick) {
-                    run.turn(index, tick, false);
+                    run.execute(index, tick);
                 }
             }
             run.record();
@@ -644,12 +649,12 @@ fn what_neither_samples_nor_counters_tell_is_not_claimed() {
         run.finish();
         let replays = replays(&file);
         let observer = replays.iter().find(|replay| replay.role == "observer").unwrap();
-        let told = observer.limit.as_ref().map(|limit| limit.tick);
-        assert_eq!((&observer.difference, told), (&None, limit), "{held:?}: {observer:?}");
+        let found = observer.limit.as_ref().map(|limit| limit.tick);
+        assert_eq!((&observer.difference, found), (&None, limit), "{held:?}: {observer:?}");
     }
 }
 
-/// A controller whose successor is ready after more ticks than links are deep in a replay.
+/// Outages shorter and longer than the depth of the links in a replay.
 #[test]
 fn an_outage_of_any_length_is_replayed() {
     let bench = Bench::new();
@@ -661,19 +666,17 @@ fn an_outage_of_any_length_is_replayed() {
             let mut run = Scheduled::new(&scenario, &bus, &file);
             for tick in 0..=scenario.last_tick {
                 match tick.checked_sub(400) {
-                    Some(0) => run.die(victim),
-                    Some(dead) if dead == outage => run.begin(victim, tick),
+                    Some(0) => run.kill(victim),
+                    Some(ticks) if ticks == outage => run.begin(victim, tick),
                     _ => {}
                 }
-                (0..4).for_each(|index| {
-                    run.turn(index, tick, false);
-                });
+                (0..4).for_each(|index| run.execute(index, tick));
                 run.record();
             }
             run.finish();
             for replay in replays(&file) {
-                let told = format!("{victim} {outage} {replay:?}");
-                assert_eq!((replay.difference, replay.limit), (None, None), "{told}");
+                let description = format!("{victim} {outage} {replay:?}");
+                assert_eq!((replay.difference, replay.limit), (None, None), "{description}");
             }
         }
     }

@@ -432,8 +432,8 @@ fn bad_input_is_told_and_never_a_panic() {
         std::fs::write(bench.path(name), bytes).unwrap();
         bench.path(name)
     };
-    told(&file("text.mcap", b"no recording"), 2, &["is no recording of corotate"]);
-    told(&file("nothing.mcap", b""), 2, &["is no recording of corotate"]);
+    told(&file("text.mcap", b"no recording"), 2, &["[not-a-recording]"]);
+    told(&file("nothing.mcap", b""), 2, &["[not-a-recording]"]);
     relabel(&directory.join("run.mcap"), &bench.path("other.mcap"), "estimate/v2", "estimate/v9");
     let done = report(&bench, &bench.path("other.mcap"), &[]);
     assert!(done.code == Some(2) && done.stderr.contains("estimate/v9"), "{done:?}");

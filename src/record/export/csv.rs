@@ -1,4 +1,4 @@
-//! A table as CSV. Numbers are written so that the very bits are read back from them; of what is no number only that is kept.
+//! Tables as CSV. A number read back has the same bits; a NaN loses its payload.
 
 use super::table::{Table, columns};
 use crate::files::Created;

@@ -1,6 +1,6 @@
-//! A table as Parquet, by the library's writers of columns: no Arrow is in between.
+//! Tables as Parquet, written by column without Arrow.
 //!
-//! Every bit is kept, of what is no number too. Must not hold more than the rows of one group.
+//! Keeps every bit, also of NaNs. Must not hold more than the rows of one group.
 
 use super::table::{Table, columns};
 use crate::files::Created;
@@ -16,10 +16,10 @@ use parquet::schema::types::{Type, TypePtr};
 use std::io::{self, Write};
 use std::sync::Arc;
 
-/// The rows that wait for their group, those of all tables together, come to so many bytes.
-const WAITING_BYTES: usize = 64 << 20;
-/// Every column of every group has an entry at the file's end. Beyond so many the entries weigh as much as the values, and
-/// cannot be kept in memory.
+/// Memory for the buffered rows of all tables together, bytes.
+const BUFFER_BYTES: usize = 64 << 20;
+/// Largest number of columns. The footer has an entry for every column of every group: with more columns, the entries are as
+/// large as the values and no longer fit into memory.
 pub const COLUMNS_MAX: usize = 1 << 14;
 
 /// The table of a signal.
@@ -43,13 +43,18 @@ impl Table for Parquet {
     }
 }
 
-/// What the values of a column are.
+/// The type of a column's values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ColumnKind {
+    /// Unsigned 64-bit integers.
     Unsigned,
+    /// Signed 64-bit integers.
     Whole,
+    /// Double-precision numbers.
     Number,
+    /// Booleans.
     Flag,
+    /// UTF-8 strings.
     Word,
 }
 
@@ -64,29 +69,30 @@ impl From<FieldKind> for ColumnKind {
 
 /// The value of a row in a column.
 pub enum Cell {
-    /// The bits of a number, or of a flag 0 or 1.
+    /// The bits of a number; 0 or 1 for a flag.
     Bits(u64),
+    /// A string.
     Word(String),
 }
 
-/// Rows, written a group at a time.
+/// A writer of rows, one group at a time.
 pub struct RowGroups<W: Write + Send> {
     writer: SerializedFileWriter<W>,
-    columns: Vec<Waiting>,
+    columns: Vec<BufferedColumn>,
     rows: usize,
     rows_per_group: usize,
 }
 
-/// The values of one column that wait for their group.
-struct Waiting {
+/// The values of one column in the current group.
+struct BufferedColumn {
     kind: ColumnKind,
     bits: Vec<u64>,
     words: Vec<ByteArray>,
-    /// For each row 1 where there is a value and 0 for null, if rows may be without.
+    /// The definition level of each row, 1 for a value and 0 for null; `None` if the column has no nulls.
     levels: Option<Vec<i16>>,
 }
 
-impl Waiting {
+impl BufferedColumn {
     fn push(&mut self, value: Option<Cell>) {
         if let Some(levels) = &mut self.levels {
             levels.push(value.is_some().into());
@@ -100,19 +106,21 @@ impl Waiting {
 
     fn write<W: Write + Send>(&mut self, group: &mut SerializedRowGroupWriter<'_, W>) -> Result<(), ParquetError> {
         let Self { kind, bits, words, levels } = self;
-        // The schema was made of these columns.
+        // The schema has the same columns, so there is always a next one.
         let Some(mut column) = group.next_column()? else { return Ok(()) };
-        let there = levels.as_deref();
+        let definitions = levels.as_deref();
         match kind {
             ColumnKind::Unsigned | ColumnKind::Whole => {
-                column.typed::<Int64Type>().write_batch(bytemuck::cast_slice(bits), there, None)?
+                column.typed::<Int64Type>().write_batch(bytemuck::cast_slice(bits), definitions, None)?
             }
-            ColumnKind::Number => column.typed::<DoubleType>().write_batch(bytemuck::cast_slice(bits), there, None)?,
+            ColumnKind::Number => {
+                column.typed::<DoubleType>().write_batch(bytemuck::cast_slice(bits), definitions, None)?
+            }
             ColumnKind::Flag => {
                 let flags: Vec<bool> = bits.iter().map(|bits| *bits != 0).collect();
-                column.typed::<BoolType>().write_batch(&flags, there, None)?
+                column.typed::<BoolType>().write_batch(&flags, definitions, None)?
             }
-            ColumnKind::Word => column.typed::<ByteArrayType>().write_batch(words, there, None)?,
+            ColumnKind::Word => column.typed::<ByteArrayType>().write_batch(words, definitions, None)?,
         };
         bits.clear();
         words.clear();
@@ -122,35 +130,35 @@ impl Waiting {
 }
 
 impl<W: Write + Send> RowGroups<W> {
-    /// Begins a file of these columns, with what is to be known `about` it. Where rows are `partial` any value may be null.
+    /// Begins a file with these columns and the metadata `about`. If `nullable`, any value may be null.
     pub fn begin(
         file: W,
         name: &str,
         columns: Vec<(String, ColumnKind)>,
-        partial: bool,
+        nullable: bool,
         about: Vec<(&str, String)>,
         rows_per_group: usize,
     ) -> io::Result<Self> {
-        let schema = schema(name, &columns, partial).map_err(bare)?;
-        let writer = SerializedFileWriter::new(file, schema, Arc::new(properties(about))).map_err(bare)?;
-        let waiting = |(_, kind)| {
-            let (bits, words, levels) = (Vec::new(), Vec::new(), partial.then(Vec::new));
-            Waiting { kind, bits, words, levels }
+        let schema = schema(name, &columns, nullable).map_err(io_error)?;
+        let writer = SerializedFileWriter::new(file, schema, Arc::new(properties(about))).map_err(io_error)?;
+        let column = |(_, kind)| {
+            let (bits, words, levels) = (Vec::new(), Vec::new(), nullable.then(Vec::new));
+            BufferedColumn { kind, bits, words, levels }
         };
-        Ok(Self { writer, columns: columns.into_iter().map(waiting).collect(), rows: 0, rows_per_group })
+        Ok(Self { writer, columns: columns.into_iter().map(column).collect(), rows: 0, rows_per_group })
     }
 
     /// Adds a row of values.
     pub fn row(&mut self, values: impl IntoIterator<Item = Option<Cell>>) -> io::Result<()> {
         self.columns.iter_mut().zip(values).for_each(|(column, value)| column.push(value));
         self.rows += 1;
-        if self.rows < self.rows_per_group { Ok(()) } else { self.write_group().map_err(bare) }
+        if self.rows < self.rows_per_group { Ok(()) } else { self.write_group().map_err(io_error) }
     }
 
-    /// Writes what waits, and the end.
+    /// Writes the buffered rows and the footer.
     pub fn end(mut self) -> io::Result<()> {
         let rest = if self.rows == 0 { Ok(()) } else { self.write_group() };
-        rest.and_then(|()| self.writer.finish()).map(drop).map_err(bare)
+        rest.and_then(|()| self.writer.finish()).map(drop).map_err(io_error)
     }
 
     fn write_group(&mut self) -> Result<(), ParquetError> {
@@ -161,13 +169,13 @@ impl<W: Write + Send> RowGroups<W> {
     }
 }
 
-/// The same for all tables, for they have as many rows as there are ticks.
+/// Returns the rows per group of every table. All tables grow equally fast: each has a row per tick.
 fn rows_per_group(recording: &Recording) -> usize {
-    let row_bytes = recording.signals().iter().map(|signal| 8 * super::table::OWN.len() + signal.layout.size());
-    (WAITING_BYTES / row_bytes.sum::<usize>()).max(1)
+    let row_bytes = recording.signals().iter().map(|signal| 8 * super::table::COMMON.len() + signal.layout.size());
+    (BUFFER_BYTES / row_bytes.sum::<usize>()).max(1)
 }
 
-fn schema(name: &str, columns: &[(String, ColumnKind)], partial: bool) -> Result<TypePtr, ParquetError> {
+fn schema(name: &str, columns: &[(String, ColumnKind)], nullable: bool) -> Result<TypePtr, ParquetError> {
     let field = |(name, kind): &(String, ColumnKind)| {
         let (physical, logical) = match kind {
             ColumnKind::Unsigned => (Physical::INT64, Some(LogicalType::integer(64, false))),
@@ -176,7 +184,7 @@ fn schema(name: &str, columns: &[(String, ColumnKind)], partial: bool) -> Result
             ColumnKind::Flag => (Physical::BOOLEAN, None),
             ColumnKind::Word => (Physical::BYTE_ARRAY, Some(LogicalType::String)),
         };
-        let repetition = if partial { Repetition::OPTIONAL } else { Repetition::REQUIRED };
+        let repetition = if nullable { Repetition::OPTIONAL } else { Repetition::REQUIRED };
         let builder = Type::primitive_type_builder(name, physical).with_logical_type(logical);
         builder.with_repetition(repetition).build().map(Arc::new)
     };
@@ -201,9 +209,9 @@ fn properties(about: Vec<(&str, String)>) -> WriterProperties {
     let about = about.into_iter().map(|(key, value)| KeyValue::new(format!("corotate.{key}"), value));
     WriterProperties::builder()
         .set_key_value_metadata(Some(about.collect()))
-        // By this version unsigned numbers are written as differences: ticks and times take next to nothing.
+        // Version 2 encodes integers as differences, so ticks and times take almost no space.
         .set_writer_version(WriterVersion::PARQUET_2_0)
-        // Numbers that were computed hardly repeat.
+        // Computed numbers rarely repeat.
         .set_dictionary_enabled(false)
         .set_compression(Compression::ZSTD(ZstdLevel::default()))
         .set_statistics_enabled(EnabledStatistics::Chunk)
@@ -211,10 +219,10 @@ fn properties(about: Vec<(&str, String)>) -> WriterProperties {
         .build()
 }
 
-/// The system's reason without the library's words.
-fn bare(error: ParquetError) -> io::Error {
+/// Unwraps the system's error from the library's.
+fn io_error(error: ParquetError) -> io::Error {
     match error {
         ParquetError::External(source) => source.downcast().map_or_else(io::Error::other, |system| *system),
-        other => io::Error::other(other),
+        error => io::Error::other(error),
     }
 }

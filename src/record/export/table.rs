@@ -5,27 +5,27 @@ use crate::record::reader::{Recording, SignalInfo};
 use crate::sample::{FieldKind, Layout};
 use std::io;
 
-/// A table in the making.
+/// A writer of one table.
 pub trait Table: Sized {
-    /// The extension of its file.
+    /// The file name extension.
     const EXTENSION: &'static str;
 
     /// Begins the table of a signal.
     fn begin(file: Created, recording: &Recording, signal: &SignalInfo) -> io::Result<Self>;
 
-    /// Adds a row: the bits of every column.
+    /// Adds a row from the bits of every column.
     fn row(&mut self, bits: &[u64]) -> io::Result<()>;
 
-    /// Writes what is left.
+    /// Writes the remaining rows and the end of the file.
     fn end(self) -> io::Result<()>;
 }
 
-/// The columns that every table has beside the recorded ones, before them.
-pub const OWN: [(&str, FieldKind); 2] = [("time_s", FieldKind::F64), ("received_ns", FieldKind::U64)];
+/// The first columns of every table; the recorded ones follow.
+pub const COMMON: [(&str, FieldKind); 2] = [("time_s", FieldKind::F64), ("received_ns", FieldKind::U64)];
 
-/// The name and type of every column.
+/// Returns the name and type of every column.
 pub fn columns(layout: &Layout) -> Vec<(String, FieldKind)> {
-    let own = OWN.iter().map(|(name, kind)| ((*name).to_owned(), *kind));
+    let common = COMMON.iter().map(|(name, kind)| ((*name).to_owned(), *kind));
     let recorded = layout.columns.iter().flat_map(|column| column.elements().map(|name| (name, column.kind)));
-    own.chain(recorded).collect()
+    common.chain(recorded).collect()
 }
