@@ -1,4 +1,4 @@
-"""Every test in a runtime directory of its own; doctests with what they name."""
+"""Fixtures: a private runtime directory per test, and the law of rigid-pair's controller. The motion of a free body."""
 
 import tempfile
 
@@ -9,7 +9,7 @@ pytest_plugins = ["pytester"]
 
 
 def euler(moments, rate, t):
-    """The free motion of a body, by classical Runge-Kutta steps: (n, 3) rad/s."""
+    """Returns the free motion of a body, by classical Runge-Kutta steps: (n, 3) rad/s."""
     a, b, c = moments
     slope = lambda w: np.array([(b - c) / a * w[1] * w[2], (c - a) / b * w[2] * w[0], (a - b) / c * w[0] * w[1]])
     rates, w = [], np.array(rate, dtype=float)
@@ -24,7 +24,7 @@ def euler(moments, rate, t):
 
 @pytest.fixture(autouse=True)
 def own_runtime(monkeypatch):
-    # Names of sockets limit the length of its path.
+    # A short path: socket names are limited in length.
     with tempfile.TemporaryDirectory(prefix="ct", dir="/tmp") as directory:
         monkeypatch.setenv("XDG_RUNTIME_DIR", directory)
         yield
@@ -32,7 +32,7 @@ def own_runtime(monkeypatch):
 
 @pytest.fixture
 def law():
-    """The law of rigid-pair's controller."""
+    """A controller with the law of rigid-pair's."""
     import corotate
     law = corotate.Synchronizer([1.0, 2.0, 2.5], gain=4.0)
 

@@ -1,4 +1,4 @@
-"""Functions that a process of its own can be given."""
+"""Controller functions that can be pickled, as role processes need them."""
 
 import os
 import sys
@@ -16,12 +16,13 @@ def controller(tick, inputs, outputs):
 
 
 class Unpicklable(Exception):
-    def __init__(self, one, two):
-        super().__init__(one)
+    def __init__(self, message, detail):
+        # Pickle stores only the arguments of the base class, so a copy lacks the second one.
+        super().__init__(message)
 
 
 class Fails:
-    """Fails in some way from a tick on, also if that tick itself is missed."""
+    """A controller that fails in the given way at a tick, or at the next one if that is missed."""
 
     def __init__(self, how, tick, marker=None):
         self.how, self.tick, self.marker = how, tick, marker
@@ -47,7 +48,7 @@ class Fails:
         sys.exit(3)
 
     def unpicklable(self, outputs):
-        raise Unpicklable("one", "two")
+        raise Unpicklable("message", "detail")
 
     def die(self, outputs):
         os._exit(7)

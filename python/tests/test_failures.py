@@ -1,4 +1,4 @@
-"""Functions in the seats of roles that raise, hang, die or are slow: what their caller gets, and when."""
+"""Roles in Python that raise, hang, die or are slow: the exception that the caller gets, and when."""
 
 import io
 import os
@@ -15,11 +15,11 @@ import pytest
 import corotate
 from controllers import Fails, Unpicklable
 
-WHERE = pytest.mark.parametrize("clock, where", [
+EVERYWHERE = pytest.mark.parametrize("clock, where", [
     ("in-process", "thread"), ("lockstep", "thread"), ("lockstep", "process"), ("realtime", "thread"), ("realtime", "process")])
-# Long enough not to end by itself before its functions fail; a rate that Python keeps up with anywhere.
+# Does not end before its functions fail. Python keeps up with this rate on any machine.
 ENDLESS = {"duration_s": 60, "tick_hz": 100, "accept": {}}
-# The launcher must not find out by silence.
+# The launcher must notice the failure without a heartbeat timeout.
 PATIENT = {"supervision.heartbeat_timeout_s": 3600.0}
 
 
@@ -29,32 +29,32 @@ def run(tmp_path, clock, where, function, **options):
 
 
 def lines(error):
-    """An exception with its causes as text: what a user sees."""
+    """Returns an exception with its causes as the user sees it."""
     return "".join(traceback.format_exception(error))
 
 
-@WHERE
+@EVERYWHERE
 @pytest.mark.parametrize("how, tick, raises", [("shape", 0, ValueError), ("typo", 3, AttributeError)])
-def test_a_function_that_raises_ends_the_run_with_its_own_exception(tmp_path, clock, where, how, tick, raises):
+def test_an_exception_of_a_role_ends_the_run_and_reaches_the_caller(tmp_path, clock, where, how, tick, raises):
     function = Fails(how, tick, tmp_path / "at")
     with pytest.raises(raises) as caught:
         run(tmp_path, clock, where, function, set=PATIENT)
     raised_at, raised_s = (tmp_path / "at").read_text().split()
-    assert time.time() - float(raised_s) < 300, "the launcher is told, and does not wait for silence"
+    assert time.time() - float(raised_s) < 300, "the launcher must not wait for a timeout"
     assert f"in {how}" in lines(caught.value) and "controllers.py" in lines(caught.value)
     if clock == "in-process":
         return
-    made = caught.value.run
-    [incident] = made.summary["incidents"]
-    assert made.accepted is False and made.summary["verdict"] != "accepted"
+    ended = caught.value.run
+    [incident] = ended.summary["incidents"]
+    assert ended.accepted is False and ended.summary["verdict"] != "accepted"
     assert incident["role"] == "controller" and f"in {how}" in incident["last_words"]
-    # In real time the tick before may not be committed where that one was missed.
+    # In real time, missed ticks just before this one may not be committed: the incident then has an earlier tick.
     assert incident["tick"] == int(raised_at) if clock == "lockstep" else incident["tick"] <= int(raised_at)
 
 
 @pytest.mark.parametrize("where", ["thread", "process"])
 @pytest.mark.parametrize("how, raises", [("interrupt", KeyboardInterrupt), ("leave", SystemExit), ("unpicklable", Unpicklable)])
-def test_whatever_it_is_that_a_function_raises(tmp_path, where, how, raises):
+def test_exit_interrupt_and_unpicklable_exceptions_reach_the_caller(tmp_path, where, how, raises):
     # An exception that cannot be pickled travels as text.
     raises = corotate.CorotateError if (where, how) == ("process", "unpicklable") else raises
     with pytest.raises(raises) as caught:
@@ -62,21 +62,21 @@ def test_whatever_it_is_that_a_function_raises(tmp_path, where, how, raises):
     assert f"in {how}" in lines(caught.value) and caught.value.run.accepted is False
 
 
-def test_a_process_that_dies_is_told(tmp_path):
+def test_a_dead_role_process_raises_with_its_exit_code(tmp_path):
     with pytest.raises(corotate.CorotateError, match="exit code 7") as caught:
         run(tmp_path, "lockstep", "process", Fails("die", 5))
     assert caught.value.run.summary["incidents"][0]["tick"] == 5
 
 
-def test_a_function_that_cannot_be_sent_or_received_is_told(tmp_path):
+def test_a_function_that_cannot_be_pickled_raises(tmp_path):
     with pytest.raises(Exception, match="pickle"):
         run(tmp_path, "lockstep", "process", lambda tick, inputs, outputs: None)
 
 
-@WHERE
+@EVERYWHERE
 @pytest.mark.parametrize("how", ["sleep", "loop"])
-def test_a_function_that_hangs_is_left_in_time(tmp_path, clock, where, how):
-    # In a process of its own: a function that sleeps goes on for as long as this one lives.
+def test_the_timeout_ends_a_run_with_a_hanging_function(tmp_path, clock, where, how):
+    # In a separate process: a sleeping function would continue in a thread of this one.
     program = f"""
         import sys, time, corotate
         from controllers import Fails
@@ -92,58 +92,58 @@ def test_a_function_that_hangs_is_left_in_time(tmp_path, clock, where, how):
     path.write_text(textwrap.dedent(program))
     done = subprocess.run([sys.executable, str(path)], env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)}, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    # Within a second where nothing else runs; a loaded machine takes its time to end processes, though not an hour.
+    # No upper limit: a loaded machine may end processes slowly. The function would sleep for an hour.
     assert float(done.stdout) >= 5, done
 
 
-def test_a_function_in_pdb_is_waited_for_in_lockstep(tmp_path):
-    class Typed(io.StringIO):
+def test_lockstep_waits_for_a_function_in_pdb(tmp_path):
+    class SlowUser(io.StringIO):
         def readline(self):
             time.sleep(3)
             return "continue\n"
 
     def debugged(tick, inputs, outputs):
         if tick == 5:
-            pdb.Pdb(stdin=Typed(), stdout=io.StringIO(), nosigint=True).set_trace()
+            pdb.Pdb(stdin=SlowUser(), stdout=io.StringIO(), nosigint=True).set_trace()
 
-    made = run(tmp_path, "lockstep", "thread", debugged, set={"supervision.heartbeat_timeout_s": 0.5, "duration_s": 0.5})
-    assert made.summary["incidents"] == [] and made.summary["books"]["roles"]["controller"]["executed"] == 51
+    ended = run(tmp_path, "lockstep", "thread", debugged, set={"supervision.heartbeat_timeout_s": 0.5, "duration_s": 0.5})
+    assert ended.summary["incidents"] == [] and ended.summary["books"]["roles"]["controller"]["executed"] == 51
 
 
-def test_a_function_that_is_slow_once_is_waited_for_in_lockstep(tmp_path):
+def test_lockstep_waits_for_a_slow_function_up_to_the_external_timeout(tmp_path):
     def slow(tick, inputs, outputs):
         if tick == 5:
             time.sleep(3)
 
     brief = {"supervision.heartbeat_timeout_s": 0.5, "duration_s": 0.5}
-    made = run(tmp_path, "lockstep", "thread", slow, set=brief)
-    assert made.summary["incidents"] == [] and made.summary["books"]["roles"]["controller"]["executed"] == 51
+    ended = run(tmp_path, "lockstep", "thread", slow, set=brief)
+    assert ended.summary["incidents"] == [] and ended.summary["books"]["roles"]["controller"]["executed"] == 51
     limited = {**brief, "launch.external_timeout_s": 0.5}
-    with pytest.raises(corotate.CorotateError, match="kept the run waiting for 0.5 s") as caught:
+    with pytest.raises(corotate.CorotateError, match="0.5 s") as caught:
         corotate.run("rigid-pair", set={**ENDLESS, **limited}, roles={"controller": slow}, out=tmp_path / "limited")
     [incident] = caught.value.run.summary["incidents"]
     assert incident["tick"] == 5 and caught.value.run.accepted is False
 
 
-def test_a_silent_function_is_told_by_the_tick_that_it_is_at(tmp_path):
+def test_the_incident_of_a_silent_function_has_its_current_tick(tmp_path):
     def hangs(tick, inputs, outputs):
         seen.append(tick)
         if tick >= 20:
             time.sleep(30)
 
     seen = []
-    with pytest.raises(corotate.CorotateError, match="said nothing") as caught:
+    with pytest.raises(corotate.CorotateError, match="controller") as caught:
         run(tmp_path, "realtime", "thread", hangs, set={"supervision.heartbeat_timeout_s": 3.0})
     [incident] = caught.value.run.summary["incidents"]
-    # Ticks that were missed before it began the last one are not finished either.
+    # Ticks missed between the last two calls are not finished either.
     finished, began = seen[-2:]
     assert finished < incident["tick"] <= began
 
 
-def test_a_run_that_lost_a_role_of_its_own_raises(tmp_path):
-    lost = {"supervision.on_failure": "stop", "fault": [{"kind": "kill", "role": "observer", "from_tick": 50}]}
-    with pytest.raises(corotate.CorotateError, match="observer failed at tick") as caught:
-        corotate.run("rigid-pair", set={**ENDLESS, **lost}, out=tmp_path / "run")
+def test_a_run_that_lost_a_built_in_role_raises(tmp_path):
+    kill = {"supervision.on_failure": "stop", "fault": [{"kind": "kill", "role": "observer", "from_tick": 50}]}
+    with pytest.raises(corotate.CorotateError, match="observer") as caught:
+        corotate.run("rigid-pair", set={**ENDLESS, **kill}, out=tmp_path / "run")
     assert caught.value.run.accepted is False
 
 
@@ -158,5 +158,5 @@ def test_a_traceback_in_pytest_is_short(pytester):
     done.assert_outcomes(failed=2)
     text = done.stdout.str()
     assert "Parameters" not in text and "record_property" not in text, text
-    # The launcher's own line about the incident is captured beside it.
-    assert "no 'comand' here" in text and "rigid-pear" in text
+    # The launcher's line about the incident is captured too.
+    assert "'comand'" in text and "rigid-pear" in text

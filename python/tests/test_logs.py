@@ -1,4 +1,4 @@
-"""The observers on arrays."""
+"""Identification, observers and control laws on arrays."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def test_inertia_is_found_up_to_scale():
     assert np.allclose(np.abs(found.axes), np.eye(3), atol=0.02) and found.r_squared.min() > 0.99
 
 
-def test_segments_are_held_apart():
+def test_segments_are_identified_separately():
     twice = np.vstack([euler(BODY, rate, T) for rate in ([0.6, -0.4, 0.8], [0.2, 0.7, -0.5])])
     labels = np.repeat(["a", "b"], len(T))
     found = corotate.identify(np.concatenate([T, T]), twice, segments=labels, damping=False)
@@ -34,7 +34,7 @@ def test_a_hidden_rate_is_reconstructed(hidden, filter):
     assert np.abs(rate - w[:, hidden - 1])[len(T) // 2:].max() < 5e-3
 
 
-def test_mistakes_are_told():
+def test_wrong_arguments_raise():
     with pytest.raises(ValueError, match="decay"):
         corotate.HiddenRate(BODY)
     with pytest.raises(corotate.CorotateError):
@@ -46,7 +46,7 @@ def test_mistakes_are_told():
 
 
 @pytest.mark.parametrize("name, body, target, damping", [("orbit-hold", "spacecraft", 1.3, 1.8), ("orbit-rendezvous", "follower", None, 2.0)])
-def test_the_orbit_law_is_the_one_that_runs(tmp_path, name, body, target, damping):
+def test_the_orbit_law_equals_that_of_a_run(tmp_path, name, body, target, damping):
     run = corotate.run(name, clock="in-process", set={"duration_s": 1, "controller.predict": True, "accept": {}}, record=True, out=tmp_path / "run")
     observed = "leader" if target is None else body
     law = corotate.OrbitHold((1.0, damping, 1.0), thrust_max=0.5, lead_s=1e-3)

@@ -12,7 +12,7 @@ def recording(tmp_path_factory):
     return corotate.run("rigid-pair", clock="in-process", record=True, out=out).recording
 
 
-def test_fields_are_arrays_without_a_copy(recording):
+def test_a_field_is_one_read_only_array(recording):
     rates = recording.array("leader/estimate.omega_rad_s")
     assert rates.shape == (10_001, 3) and rates.dtype == np.float64
     assert np.shares_memory(rates, recording.array("leader/estimate.omega_rad_s")) and not rates.flags.writeable
@@ -29,7 +29,7 @@ def test_many_signals_are_read_in_one_pass(recording):
     assert loaded.load("leader/truth") is loaded
 
 
-def test_values_are_those_of_the_export(recording, tmp_path):
+def test_values_equal_the_exported_ones(recording, tmp_path):
     import csv
     import subprocess
     import sys
@@ -49,7 +49,7 @@ def test_status_bits_are_columns(recording):
     assert table.num_rows == 10_001 and "time_s" in table.column_names
 
 
-def test_fleets_have_an_axis_of_bodies(tmp_path):
+def test_a_fleet_s_array_has_an_axis_of_bodies(tmp_path):
     run = corotate.run("rigid-fleet", clock="in-process", set={"duration_s": 0.2, "accept": {}}, record=True, out=tmp_path / "fleet")
     recording = run.recording
     signal = next(name for name in recording.signals if name.endswith("/truth") and not name.startswith("leader"))
@@ -57,7 +57,7 @@ def test_fleets_have_an_axis_of_bodies(tmp_path):
     assert rates.ndim == 3 and rates.shape[2] == 3 and rates.shape[1] > 1
 
 
-def test_what_is_not_there_is_told(recording, tmp_path):
+def test_an_unknown_signal_field_or_file_raises(recording, tmp_path):
     with pytest.raises(KeyError, match="it has"):
         recording.array("leader/estimat.omega_rad_s")
     with pytest.raises(KeyError, match="no field"):

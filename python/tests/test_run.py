@@ -1,4 +1,4 @@
-"""Runs: verdicts, bits, roles in Python, and what is said to mistakes."""
+"""Runs: verdicts, bits, roles in Python, and errors."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ def commands(run):
     return run.recording.array("follower/command.acceleration_rad_s2")
 
 
-def test_a_run_has_the_bits_of_every_clock(tmp_path):
+def test_a_run_has_the_same_bits_by_every_clock(tmp_path):
     runs = [corotate.run("rigid-pair", clock=clock, out=tmp_path / clock) for clock in ("in-process", "lockstep")]
     assert [run.accepted for run in runs] == [True, True]
     assert runs[0].hash == runs[1].hash
@@ -26,24 +26,24 @@ def test_a_run_has_the_bits_of_every_clock(tmp_path):
     assert "accepted" in repr(runs[0]) and (tmp_path / "lockstep/summary.json").exists()
 
 
-def test_a_controller_in_python_moves_the_bodies_as_the_built_in_one(tmp_path, law):
+def test_a_controller_in_python_has_the_bits_of_the_built_in_controller(tmp_path, law):
     built_in = corotate.run("rigid-pair", clock="lockstep", set=SHORT, record=True, out=tmp_path / "built-in")
     for where, function in (("thread", law), ("process", controllers.controller)):
         own = corotate.run("rigid-pair", clock="lockstep", set=SHORT, record=True, roles={"controller": function}, roles_in=where,
                            out=tmp_path / where)
         assert np.array_equal(commands(own), commands(built_in)), where
         for signal_name in ("leader/estimate", "follower/truth"):
-            mine, theirs = (run.recording.array(f"{signal_name}.omega_rad_s") for run in (own, built_in))
-            assert np.array_equal(mine, theirs)
+            rates, expected = (run.recording.array(f"{signal_name}.omega_rad_s") for run in (own, built_in))
+            assert np.array_equal(rates, expected)
         assert own.summary["books"]["balanced"] and own.summary["books"]["roles"]["controller"]["executed"] == 3001
     stepped = corotate.run("rigid-pair", clock="in-process", set=SHORT, roles={"controller": law}, out=tmp_path / "stepped")
     assert stepped.hash == own.hash
     assert stepped.metrics["sync_error_rad_s"]["last"] == built_in.metrics["sync_error_rad_s"]["last"]
 
 
-def test_an_observer_and_a_body_in_python(tmp_path):
+def test_an_observer_and_a_body_can_be_in_python(tmp_path):
     def observer(tick, inputs, outputs):
-        # A guess that stays: all that it knows is what is measured.
+        # A constant guess of the hidden component.
         if inputs.measurement is not None:
             outputs.estimate.omega_rad_s = [*inputs.measurement.omega_rad_s[:2], 0.8]
 
@@ -59,18 +59,18 @@ def test_an_observer_and_a_body_in_python(tmp_path):
     run = corotate.run("rigid-pair", clock="lockstep", set={**SHORT, "limits": {}}, record=True, roles={"follower": follower},
                        out=tmp_path / "follower")
     truth, measured = (run.recording.array(f"follower/{signal}.omega_rad_s") for signal in ("truth", "measurement"))
-    assert np.array_equal(truth, measured), "what a body does not tell of itself, its sensors say"
+    assert np.array_equal(truth, measured), "truth defaults to the measurement"
     assert run.metrics["sync_error_rad_s"]["last"] < 0.1
 
 
-def test_real_time_counts_what_python_misses(tmp_path, law):
+def test_ticks_missed_by_python_are_counted_in_real_time(tmp_path, law):
     run = corotate.run("rigid-pair", clock="realtime", set={**SHORT, "tick_hz": 100}, roles={"controller": law}, out=tmp_path / "rt")
     counters = run.summary["books"]["roles"]["controller"]
     assert run.summary["books"]["balanced"] and counters["executed"] + counters["missed"] == counters["elapsed"]
     assert counters["executed"] > 100
 
 
-def test_an_output_belongs_to_its_tick_and_an_input_stays(tmp_path):
+def test_an_output_is_read_only_after_its_tick_and_inputs_are_copies(tmp_path):
     kept = []
 
     def controller(tick, inputs, outputs):
@@ -85,34 +85,34 @@ def test_an_output_belongs_to_its_tick_and_an_input_stays(tmp_path):
     assert not np.array_equal(first, last) and not first.flags.writeable
 
 
-def test_mistakes_are_told_with_the_program_s_own_words(tmp_path):
-    for scenario, options, words in [
-        ("rigid-pear", {}, "known here"),
+def test_wrong_arguments_raise_with_their_name(tmp_path):
+    for scenario, options, name in [
+        ("rigid-pear", {}, "rigid-pear"),
         (tmp_path / "none.toml", {}, "none.toml"),
-        ("rigid-pair", {"set": {"leader.measured_axis": [1]}}, "did you mean"),
+        ("rigid-pair", {"set": {"leader.measured_axis": [1]}}, "measured_axis"),
         ("rigid-pair", {"set": {"duration_s": -1}}, "duration_s"),
-        ("rigid-pair", {"clock": "wall"}, "there is no clock"),
+        ("rigid-pair", {"clock": "wall"}, "wall"),
         ("rigid-pair", {"roles": {"pilot": print}}, "pilot"),
-        ("rigid-pair", {"clock": "in-process", "roles": {"observer": print}}, "can only be the controller"),
+        ("rigid-pair", {"clock": "in-process", "roles": {"observer": print}}, "controller"),
         ({"rig": "rigid-body"}, {}, "missing"),
     ]:
-        with pytest.raises(ValueError, match=words):
+        with pytest.raises(ValueError, match=name):
             corotate.run(scenario, out=tmp_path / "mistake", **options)
 
 
-def test_a_scenario_may_be_tables(tmp_path):
+def test_a_scenario_may_be_a_dictionary(tmp_path):
     import tomllib
     text = corotate.run("rigid-pair", clock="in-process", record=True, out=tmp_path / "a").recording.toml
     run = corotate.run({**tomllib.loads(text), "clock": "in-process"}, clock="in-process", out=tmp_path / "b")
     assert run.accepted
 
 
-def test_a_run_that_takes_too_long_and_ctrl_c_end_it_in_order(tmp_path):
+def test_a_timeout_and_ctrl_c_end_a_run_in_order(tmp_path):
     with pytest.raises(TimeoutError):
         corotate.run("rigid-pair", set={"duration_s": 100_000, "accept": {}}, timeout_s=1, out=tmp_path / "late")
     left = os.path.join(os.environ["XDG_RUNTIME_DIR"], "corotate")
     assert not os.path.exists(left) or not os.listdir(left)
-    # Whoever is started in the background by a shell ignores it.
+    # A process that a shell starts in the background ignores SIGINT.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         threading.Timer(1.0, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
@@ -125,7 +125,7 @@ def test_a_run_that_takes_too_long_and_ctrl_c_end_it_in_order(tmp_path):
     assert (tmp_path / "ctrl-c/summary.json").exists()
 
 
-def test_what_is_claimed_of_a_loop():
-    [claim] = corotate.certificate("rigid-pair")
-    assert claim["body"] == "follower" and 3.9 < claim["loop_rate_per_s"] < 4.1
+def test_the_certificate_of_a_loop_has_its_rate():
+    [certificate] = corotate.certificate("rigid-pair")
+    assert certificate["body"] == "follower" and 3.9 < certificate["loop_rate_per_s"] < 4.1
     assert corotate.certificate("inertia") == []

@@ -1,4 +1,4 @@
-"""A role as a loop of this process, in a run of another."""
+"""A role as a Python loop that joins a run of another process."""
 
 import json
 import subprocess
@@ -11,9 +11,9 @@ import corotate
 
 
 def start(tmp_path, *options):
-    line = [sys.executable, "-m", "corotate", "run", "rigid-pair", "--external", "controller", "--events", "--out", str(tmp_path / "run"),
+    command = [sys.executable, "-m", "corotate", "run", "rigid-pair", "--external", "controller", "--events", "--out", str(tmp_path / "run"),
             "--set", "accept={}", *options]
-    return subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
 
 
 def events(run):
@@ -21,7 +21,7 @@ def events(run):
         return [json.loads(line) for line in run.stdout]
 
 
-def test_a_loop_is_a_controller(tmp_path, law):
+def test_a_python_loop_can_be_the_controller(tmp_path, law):
     reference = corotate.run("rigid-pair", clock="lockstep", set={"duration_s": 3, "accept": {}}, record=True, out=tmp_path / "ref")
     run = start(tmp_path, "--clock", "lockstep", "--duration", "3", "--record")
     seat = json.loads(run.stdout.readline())["seats"]["controller"]
@@ -29,31 +29,31 @@ def test_a_loop_is_a_controller(tmp_path, law):
     for tick, inputs, outputs in corotate.Seat(seat, "controller"):
         law(tick, inputs, outputs)
         ticks += 1
-    told = events(run)
+    received = events(run)
     assert run.wait() == 0 and ticks == 3001
-    assert [event["event"] for event in told] == ["running", "results", "verdict"]
-    assert told[-1]["exit"] == 0 and told[1]["directory"] == str(tmp_path / "run")
+    assert [event["event"] for event in received] == ["running", "results", "verdict"]
+    assert received[-1]["exit"] == 0 and received[1]["directory"] == str(tmp_path / "run")
     name = "follower/command.acceleration_rad_s2"
     assert np.array_equal(corotate.Recording(tmp_path / "run").array(name), reference.recording.array(name))
 
 
-def test_a_run_is_found_by_where_its_results_go(tmp_path):
+def test_a_run_is_found_by_its_results_directory(tmp_path):
     run = start(tmp_path, "--clock", "realtime", "--tick-hz", "100", "--duration", "1")
     assert sum(1 for _ in corotate.Seat(tmp_path / "run", "controller")) > 10
     assert events(run)[-1]["event"] == "verdict" and run.wait() == 0
 
 
-def test_a_loop_that_is_left_is_told(tmp_path):
+def test_leaving_the_loop_early_is_an_incident(tmp_path):
     run = start(tmp_path, "--clock", "lockstep", "--duration", "1000")
     for tick, inputs, outputs in corotate.Seat(tmp_path / "run", "controller"):
         if tick == 50:
             break
-    told = events(run)
-    assert run.wait() == 4 and told[2]["event"] == "incident", told
-    assert told[2]["incident"]["role"] == "controller"
+    received = events(run)
+    assert run.wait() == 4 and received[2]["event"] == "incident", received
+    assert received[2]["incident"]["role"] == "controller"
 
 
-def test_without_a_run_there_is_no_seat(tmp_path):
+def test_joining_without_a_run_raises(tmp_path):
     from corotate import seat
     with pytest.raises(corotate.CorotateError, match="no run under way"):
         seat._domain(tmp_path, wait_s=0.1)

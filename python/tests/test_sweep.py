@@ -1,4 +1,4 @@
-"""Campaigns: here, and by workers of others."""
+"""Campaigns: in this process, and by workers of an executor."""
 
 import concurrent.futures
 import multiprocessing
@@ -26,11 +26,11 @@ def local(tmp_path_factory):
     return corotate.sweep(CAMPAIGN, out=tmp_path_factory.mktemp("local"))
 
 
-def the_same(one, other):
-    return all((one.directory / name).read_bytes() == (other.directory / name).read_bytes() for name in FILES)
+def same_files(first, second):
+    return all((first.directory / name).read_bytes() == (second.directory / name).read_bytes() for name in FILES)
 
 
-def test_the_table_is_a_frame_and_a_case_is_a_run(local, tmp_path):
+def test_a_row_of_the_frame_equals_a_single_run(local, tmp_path):
     frame = local.frame()
     assert len(frame) == local.counts["rows"] == 32 and frame["accepted"].sum() == local.counts["accepted"] > 0
     row = frame.loc[13]
@@ -42,18 +42,18 @@ def test_the_table_is_a_frame_and_a_case_is_a_run(local, tmp_path):
 
 
 def processes():
-    # A copy of this process would have its threads' locks as they are.
+    # A forked process would inherit locks that threads of this one hold.
     return concurrent.futures.ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn"))
 
 
 def test_processes_give_the_same_table(local, tmp_path):
-    told = []
+    progress = []
     with processes() as executor:
-        swept = corotate.sweep(CAMPAIGN, out=tmp_path, executor=executor, chunk=3, progress=lambda *numbers: told.append(numbers))
-    assert the_same(swept, local) and told[-1] == (36, 36) and len(told) == 12
+        swept = corotate.sweep(CAMPAIGN, out=tmp_path, executor=executor, chunk=3, progress=lambda *numbers: progress.append(numbers))
+    assert same_files(swept, local) and progress[-1] == (36, 36) and len(progress) == 12
 
 
-def test_a_pool_whose_worker_is_killed_costs_no_case(local, tmp_path):
+def test_a_killed_pool_worker_loses_no_case(local, tmp_path):
     with processes() as executor:
         killed = []
 
@@ -62,13 +62,13 @@ def test_a_pool_whose_worker_is_killed_costs_no_case(local, tmp_path):
                 killed.append(next(iter(executor._processes)))
                 os.kill(killed[0], signal.SIGKILL)
 
-        with pytest.warns(RuntimeWarning, match="the executor broke"):
+        with pytest.warns(RuntimeWarning, match="executor"):
             swept = corotate.sweep(CAMPAIGN, out=tmp_path, executor=executor, chunk=1, progress=kill)
-    assert the_same(swept, local)
+    assert same_files(swept, local)
 
 
-class Loses(concurrent.futures.ThreadPoolExecutor):
-    """Loses the result of the first task, as Dask may with the worker that had it: the future fails, and not by the work."""
+class LosingExecutor(concurrent.futures.ThreadPoolExecutor):
+    """Loses the result of the first task, as Dask may if its worker dies: the future fails although the task did not."""
 
     lost = 0
 
@@ -82,13 +82,15 @@ class Loses(concurrent.futures.ThreadPoolExecutor):
         return future
 
 
-def test_a_lost_result_is_made_again(local, tmp_path):
-    with Loses(2) as executor:
+def test_a_task_with_a_lost_result_is_repeated(local, tmp_path):
+    with LosingExecutor(2) as executor:
         swept = corotate.sweep(CAMPAIGN, out=tmp_path, executor=executor, chunk=3)
-    assert executor.lost == 1 and the_same(swept, local)
+    assert executor.lost == 1 and same_files(swept, local)
 
 
-class Fails(concurrent.futures.ThreadPoolExecutor):
+class FailingExecutor(concurrent.futures.ThreadPoolExecutor):
+    """Fails every task."""
+
     tries = 0
 
     def submit(self, task, *arguments):
@@ -96,13 +98,13 @@ class Fails(concurrent.futures.ThreadPoolExecutor):
         return super().submit(lambda: 1 / 0)
 
 
-def test_work_that_fails_again_is_an_error(tmp_path):
-    with Fails(1) as executor, pytest.raises(ZeroDivisionError):
+def test_a_task_that_fails_twice_raises(tmp_path):
+    with FailingExecutor(1) as executor, pytest.raises(ZeroDivisionError):
         corotate.sweep(CAMPAIGN, out=tmp_path, executor=executor, chunk=1000)
     assert executor.tries == 2
 
 
-def test_dask_gives_the_same_table_also_when_a_worker_is_killed(local, tmp_path):
+def test_dask_gives_the_same_table_even_if_a_worker_is_killed(local, tmp_path):
     cluster = distributed.LocalCluster(n_workers=3, threads_per_worker=1, dashboard_address=None, local_directory=str(tmp_path / "dask"))
     with cluster, distributed.Client(cluster) as client:
         workers, killed = client.run(os.getpid), []
@@ -114,28 +116,28 @@ def test_dask_gives_the_same_table_also_when_a_worker_is_killed(local, tmp_path)
 
         swept = corotate.sweep(CAMPAIGN, out=tmp_path / "out", executor=client.get_executor(), chunk=1, progress=kill)
         assert killed and killed[0] not in client.run(os.getpid).values()
-    assert the_same(swept, local)
+    assert same_files(swept, local)
 
 
-def test_what_was_ended_is_gone_on_with(local, tmp_path):
-    def end(done, every):
+def test_an_interrupted_campaign_is_resumed(local, tmp_path):
+    def interrupt(done, every):
         if done > 10:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        corotate.sweep(CAMPAIGN, out=tmp_path, threads=1, progress=end)
+        corotate.sweep(CAMPAIGN, out=tmp_path, threads=1, progress=interrupt)
     assert not (tmp_path / "cases.csv").exists()
-    told = []
-    swept = corotate.sweep(CAMPAIGN, out=tmp_path, progress=lambda *numbers: told.append(numbers))
-    assert told[0][0] > 10 and the_same(swept, local)
+    progress = []
+    swept = corotate.sweep(CAMPAIGN, out=tmp_path, progress=lambda *numbers: progress.append(numbers))
+    assert progress[0][0] > 10 and same_files(swept, local)
 
 
-def test_mistakes_are_told(tmp_path):
-    with pytest.raises(ValueError, match="no campaign `timing-mop`"):
+def test_wrong_campaigns_raise(tmp_path):
+    with pytest.raises(ValueError, match="timing-mop"):
         corotate.sweep("timing-mop")
     with pytest.raises(ValueError, match="gian"):
         corotate.sweep(CAMPAIGN | {"axis": [{"key": "controller.gian", "values": [1.0]}]}, out=tmp_path)
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "file").touch()
-    with pytest.raises(corotate.CorotateError, match="is not empty"):
-        corotate.sweep(CAMPAIGN, out=tmp_path / "other")
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used" / "file").touch()
+    with pytest.raises(corotate.CorotateError, match="used"):
+        corotate.sweep(CAMPAIGN, out=tmp_path / "used")

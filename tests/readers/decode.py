@@ -1,9 +1,9 @@
-"""Decodes every message of a recording with two libraries that know nothing of corotate, and writes what they found.
+"""Decodes every message of a recording with two independent libraries, and writes the values.
 
     decode.py RECORDING DIRECTORY
 
-Per library and topic one file: every field of every message as the library decoded it, in the order of the schema, packed
-again as 8 little-endian bytes each. Whoever compares these files with what was published compares every value bit for bit.
+Writes one file per library and topic: every field of every message in the order of the schema, each value packed again as
+8 little-endian bytes. The test compares these files bit for bit with what was published.
 """
 
 import re
@@ -19,7 +19,7 @@ FIELD = re.compile(r"^(uint64|float64)(?:\[(\d+)\])? (\w+)$")
 
 
 def fields(schema):
-    """The names, codes and counts of a schema's fields."""
+    """Returns name, struct code and count of every field of a schema."""
     lines = [line for line in schema.splitlines() if line and not line.startswith("#")]
     matches = [FIELD.match(line) for line in lines]
     return [(m[3], {"uint64": "Q", "float64": "d"}[m[1]], int(m[2] or 0)) for m in matches]
@@ -41,7 +41,7 @@ def by_mcap(path):
         assert reader.get_summary() is not None, "the file has no index"
         last = 0
         for schema, channel, message, decoded in reader.iter_decoded_messages():
-            assert message.log_time >= last, "messages are not in the order of their receipt"
+            assert message.log_time >= last, "messages are not in the order of receipt"
             assert message.sequence == decoded.tick
             last = message.log_time
             yield channel.topic, packed(decoded, fields(schema.data.decode()))

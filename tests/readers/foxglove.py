@@ -1,11 +1,11 @@
-"""Takes part in a run that is shown on a Foxglove WebSocket, as the protocol foxglove.sdk.v1 has it.
+"""A client of a Foxglove WebSocket with the protocol foxglove.sdk.v1.
 
     foxglove.py URL DIRECTORY [--stall]
 
-Subscribes every channel, writes what was advertised to DIRECTORY/channels.json, and takes messages until the server goes. Then
-channel N's are in DIRECTORY/N: for each the log time and the length as little-endian u64, and the payload. Every payload is
-decoded with a library that knows nothing of corotate, by the schema that was advertised; what that found, packed again, must be
-the payload. With --stall the client never reads what it has subscribed, and has next to no room for it.
+Subscribes to every channel, writes the advertised channels to DIRECTORY/channels.json, and receives messages until the server
+closes. Writes the messages of channel N to DIRECTORY/N: for each the log time and the length as little-endian u64, then the
+payload. Decodes every payload with an independent library by the advertised schema; the decoded values, packed again, must
+equal the payload. With --stall the client never reads, and its receive buffer is tiny.
 """
 
 import json
@@ -27,18 +27,18 @@ MESSAGE = 1
 CDR_HEADER = b"\x00\x01\x00\x00"
 
 
-def opened(url, stall):
-    """A connection with a little room, or with that which the system gives."""
+def open_client(url, stall):
+    """Connects, with a tiny receive buffer if stalled."""
     address = urlsplit(url)
-    plug = socket.socket()
+    connection = socket.socket()
     if stall:
-        plug.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    plug.connect((address.hostname, address.port))
-    return connect(url, sock=plug, subprotocols=["foxglove.sdk.v1"], compression=None, max_size=None, max_queue=1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    connection.connect((address.hostname, address.port))
+    return connect(url, sock=connection, subprotocols=["foxglove.sdk.v1"], compression=None, max_size=None, max_queue=1)
 
 
-def subscribed(client):
-    """Subscribes every channel; a subscription has its channel's number."""
+def subscribe(client):
+    """Subscribes to every channel, with the channel's number as that of the subscription. Returns the channels."""
     info = json.loads(client.recv())
     assert info["op"] == "serverInfo" and info["capabilities"] == [], info
     advertised = json.loads(client.recv())
@@ -55,7 +55,7 @@ def decoder(channel):
 
 
 def messages(client):
-    """Channel, log time and payload of every message, until the server goes."""
+    """Yields channel, log time and payload of every message until the server closes."""
     try:
         while True:
             message = client.recv()
@@ -68,12 +68,12 @@ def messages(client):
 
 def main():
     url, directory, stall = sys.argv[1], Path(sys.argv[2]), "--stall" in sys.argv
-    client = opened(url, stall)
-    channels = subscribed(client)
+    client = open_client(url, stall)
+    channels = subscribe(client)
     directory.mkdir()
     decoders = {channel["id"]: decoder(channel) for channel in channels}
     files = {channel["id"]: open(directory / str(channel["id"]), "wb") for channel in channels}
-    # Whoever waits for this file finds it whole.
+    # The test waits for this file, which must not appear before it is complete.
     part = directory / "channels.part"
     part.write_text(json.dumps(channels))
     part.rename(directory / "channels.json")

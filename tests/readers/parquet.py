@@ -1,9 +1,9 @@
-"""Reads every Parquet file of a directory with a library that knows nothing of corotate, and writes what it found.
+"""Reads every Parquet file of a directory with an independent library, and writes the values.
 
     parquet.py DIRECTORY
 
-Beside NAME.parquet come to lie NAME.words, every value as 8 little-endian bytes, column after column, and NAME.json: names
-and types of the columns, rows per group, metadata. Whoever compares the words compares every value bit for bit.
+Writes beside NAME.parquet: NAME.words, every value as 8 little-endian bytes, column after column; NAME.json, names and
+types of the columns, rows per group, metadata. The test compares the words bit for bit with the recording.
 """
 
 import json

@@ -1,8 +1,8 @@
-"""Holds scenario files against a JSON Schema with a validator that shares no code with ours.
+"""Validates scenario files against a JSON Schema with an independent validator.
 
     schema.py SCHEMA FILE...
 
-A line per file: its name and `valid`, or `invalid` with where the first mistake is and what the validator says of it.
+Prints a line per file: its name, and `valid`, or `invalid` with place and message of the most deeply nested error.
 """
 
 import json
@@ -19,8 +19,8 @@ for name in sys.argv[2:]:
     scenario = tomllib.loads(Path(name).read_text(encoding="utf-8"))
     errors = list(validator.iter_errors(scenario))
     if errors:
-        first = max(errors, key=lambda error: len(error.absolute_path))
-        place = ".".join(str(step) for step in first.absolute_path)
-        print(f"{name}: invalid: {place}: {first.message}".replace("\n", " "))
+        deepest = max(errors, key=lambda error: len(error.absolute_path))
+        place = ".".join(str(step) for step in deepest.absolute_path)
+        print(f"{name}: invalid: {place}: {deepest.message}".replace("\n", " "))
     else:
         print(f"{name}: valid")
