@@ -23,7 +23,7 @@ const ELSEWHERE: [(&str, &str); 30] = [
     ("cargo build --release", "for a board, in firmware/; tests/board"),
     ("cargo bench --bench", "tests/run, short"),
     ("corotate bench", "five minutes; tests/tools/bench.rs, some rows"),
-    ("cargo test --release --features hooks --test all claims::a_sampled", "tests/runs/claims.rs"),
+    ("cargo test --release --features hooks --test all claims::claims_of_sampled", "tests/runs/claims.rs"),
     ("corotate run config/rigid-pair.toml --external follower", "it waits for a partner; tests/runs/hil.rs"),
     (
         "corotate run rigid-pair --external follower",
