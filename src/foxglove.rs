@@ -41,7 +41,7 @@ pub struct FoxgloveOptions {
     /// The address to listen on; port 0 lets the system choose a port.
     pub address: SocketAddr,
     /// The file to write the URL to, instead of stderr.
-    pub tell: Option<PathBuf>,
+    pub url_file: Option<PathBuf>,
 }
 
 /// A failure to publish a run.
@@ -79,7 +79,7 @@ pub enum FoxgloveError {
     /// The file for the URL could not be written.
     #[error("cannot write {}: {source}", path.display())]
     #[strum(serialize = "cannot-write")]
-    Tell {
+    UrlFile {
         /// The file.
         path: PathBuf,
         /// The system's reason.
@@ -137,9 +137,9 @@ fn publish(
     // The server's threads inherit the low priority of this one.
     let server = listen(options.address, scenario, &channels)?;
     let url = format!("ws://{}", SocketAddr::new(options.address.ip(), server.port()));
-    match &options.tell {
+    match &options.url_file {
         Some(path) => {
-            write_whole(path, url.as_bytes()).map_err(|source| FoxgloveError::Tell { path: path.clone(), source })?
+            write_whole(path, url.as_bytes()).map_err(|source| FoxgloveError::UrlFile { path: path.clone(), source })?
         }
         None => crate::system::tell(format_args!("foxglove: {url}")),
     }

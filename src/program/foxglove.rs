@@ -61,7 +61,7 @@ fn serve(_: &Arguments) -> Ended {
 fn serve(Arguments { domain, address, tell, parent }: &Arguments) -> Ended {
     use crate::foxglove::{FoxgloveError, FoxgloveOptions, run_foxglove};
     let (domain, terminated) = super::runs::join(*parent, domain.as_deref())?;
-    let options = FoxgloveOptions { domain: Some(domain), address: *address, tell: tell.clone() };
+    let options = FoxgloveOptions { domain: Some(domain), address: *address, url_file: tell.clone() };
     run_foxglove(&options, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
         FoxgloveError::Run(_) => fail(Exit::Usage, error),
         _ => fail(Exit::Failure, error),

@@ -60,7 +60,7 @@ pub fn run_recorder(options: &RecorderOptions, terminated: &AtomicBool) -> Resul
     let credit_ticks = lockstep.then(|| CREDIT_TICKS.min(window_ticks(&scenario) / 4).max(1));
     let ended =
         follow(&mut recorder, &mut launcher, credit_ticks, &|| terminated.load(Ordering::Relaxed) || !domain.exists());
-    with_realtime_priority(|| recorder.leave());
+    with_realtime_priority(|| recorder.close_links());
     let report = recorder.finish(&role_reports(&domain, &scenario), ended.as_ref().err());
     let path = report_path(domain.root(), RECORDER);
     let text = serde_json::to_vec(&report).expect("a report of plain values is JSON");

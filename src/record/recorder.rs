@@ -192,13 +192,13 @@ impl Recorder {
     }
 
     /// Closes all links and keeps their counters. [`Self::finish`] does so too.
-    pub fn leave(&mut self) {
+    pub fn close_links(&mut self) {
         self.signals.extend(self.taps.close().into_iter().map(SignalReport::new));
     }
 
     /// Ends the file with the counters of the recording and of the roles. `problem` is the reason of an early end.
     pub fn finish(mut self, roles: &[RoleReport], problem: Option<&RecordError>) -> RecordingReport {
-        self.leave();
+        self.close_links();
         let mut report = RecordingReport {
             file: std::mem::take(&mut self.file),
             complete: true,
