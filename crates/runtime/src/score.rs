@@ -203,6 +203,13 @@ impl<R: Rig, B: Bus> TruthInput<R, B> {
         }
     }
 
+    fn refresh(&mut self) {
+        match self {
+            Self::One(input) => input.refresh(),
+            Self::Fleet(input) => input.refresh(),
+        }
+    }
+
     /// Returns the number of samples received.
     fn samples(&mut self) -> u64 {
         match self {
@@ -416,6 +423,12 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         Ok(!waiting)
     }
 
+    /// Connects every input to its current writer: a writer that ends unconnected takes its samples with it.
+    fn connect(&mut self) {
+        self.estimate.refresh();
+        self.truths.iter_mut().for_each(TruthInput::refresh);
+    }
+
     fn score_tick(&mut self) {
         let tick = self.scoring.next_tick;
         let estimate = at(&self.estimate, tick);
@@ -494,7 +507,11 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
         {
             self.score_tick();
         }
-        Ok(self.next_tick() - before)
+        let scored = self.next_tick() - before;
+        if scored == 0 {
+            self.connect();
+        }
+        Ok(scored)
     }
 
     fn next_tick(&self) -> u64 {
@@ -529,5 +546,39 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
         let estimates = self.estimate.counters().samples();
         let truths = self.truths.iter_mut().map(TruthInput::samples);
         Ok(self.scoring.finish(core::iter::once(estimates).chain(truths)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::bus::domain::OwnedDomain;
+    use crate::bus::iox::IoxBus;
+    use crate::config::SHIPPED;
+    use crate::runtime::{Poll, RoleId, RunCondition, depths, private_ledger};
+    use crate::scenario::{Scenario, build, scorer};
+
+    /// A follower sends the first truth and ends before any estimate has arrived.
+    #[test]
+    fn a_truth_whose_writer_has_ended_is_scored() {
+        let (name, text) = SHIPPED[0];
+        let overrides = ["clock=lockstep", "duration_s=0.002", "accept={}"].map(str::to_owned);
+        let scenario = &Scenario::parse(text, name, &overrides).unwrap();
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = IoxBus::enter(domain.domain(), "test", depths(scenario)).unwrap();
+        let mut scorer = scorer(scenario, &bus).unwrap();
+        let roles = RoleId::all(scenario);
+        let ledgers: Vec<_> = roles.iter().map(|role| private_ledger(scenario, *role)).collect();
+        let nodes = roles.iter().zip(&ledgers).map(|(role, ledger)| build(scenario, *role, &bus, ledger).unwrap());
+        let mut nodes: Vec<_> = nodes.collect();
+        assert_eq!(scorer.poll(u64::MAX).unwrap(), 0);
+        let follower = roles.iter().position(|role| *role == RoleId::Plant(1)).unwrap();
+        let mut follower = nodes.remove(follower);
+        for node in std::iter::once(&mut follower).chain(&mut nodes) {
+            assert_eq!(node.poll(RunCondition::Inputs { up_to: 0 }).unwrap(), Poll::Executed);
+            node.finish_tick().unwrap();
+        }
+        drop(follower);
+        assert_eq!(scorer.poll(u64::MAX).unwrap(), 1);
+        assert_eq!(scorer.finish().unwrap().unscored_ticks, 0);
     }
 }
