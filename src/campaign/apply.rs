@@ -1,4 +1,4 @@
-//! How a value of an axis gets into a scenario.
+//! Puts the value of an axis into a scenario.
 //!
 //! Must not know which case it belongs to.
 
@@ -6,15 +6,15 @@ use super::axis;
 use crate::config::{ConfigError, Document, Place};
 use toml::Value;
 
-/// How a key ends that is every number of a table.
+/// The end of a key that stands for every number of a table.
 pub(super) const EVERY: &str = ".*";
-/// The quantities of a fault of which none is no fault at all.
+/// The quantities of a fault that switch it off at zero.
 const AMOUNTS: [&str; 7] =
     ["probability", "ticks", "delay_ticks", "jitter_ticks", "stall_ms", "deviation", "weakly_hard.misses"];
-/// Of these two, one alone is a delay.
+/// A fault delays while one of these two is above zero.
 const LATENESS: [&str; 2] = ["delay_ticks", "jitter_ticks"];
 
-/// The number of the fault that an axis has switched off: one of which there is nothing.
+/// Returns the number of the fault that the value of an axis has switched off.
 pub(super) fn fault_that_is_off(document: &Document, key: &str) -> Option<usize> {
     let (number, amount) = key.strip_prefix("fault.")?.split_once('.')?;
     let none =
@@ -24,7 +24,7 @@ pub(super) fn fault_that_is_off(document: &Document, key: &str) -> Option<usize>
     number.parse().ok().filter(|_| off)
 }
 
-/// Puts a value where an axis has it: a number for a list of numbers is each of them, a factor is one of what is there.
+/// Puts a value at the key of an axis. A number replaces each number of a list; a factor multiplies the existing value.
 pub(super) fn put(
     document: &mut Document,
     key: &str,
@@ -43,7 +43,7 @@ pub(super) fn put(
     let put = match (there, factor) {
         (there, true) => there.and_then(|there| times(there, value)).ok_or_else(|| {
             let reason =
-                "is no number in the scenario, so nothing can be a factor of it; give values, or put it into [set]";
+                "is not a number in the scenario and cannot be multiplied; give values, or put the key into [set]";
             ConfigError::invalid(place.clone(), key, "not-a-factor", reason)
         })?,
         (Some(Value::Array(list)), false) if axis::number(value).is_some() && list.iter().all(is_number) => {
@@ -58,7 +58,7 @@ fn is_number(value: &Value) -> bool {
     axis::number(value).is_some()
 }
 
-/// A number, or each of a list of them, times a factor; none of anything else.
+/// Multiplies a number, or each number of a list, by a factor; `None` for any other value.
 fn times(there: &Value, factor: &Value) -> Option<Value> {
     if let Value::Array(list) = there {
         return list.iter().map(|there| times(there, factor)).collect::<Option<_>>().map(Value::Array);
@@ -72,7 +72,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_fault_of_which_nothing_is_left_is_off_and_no_other() {
+    fn a_fault_is_off_only_when_all_its_amounts_are_zero() {
         let off = |fault: &str, key: &str| {
             let document = Document::parse(&format!("[[fault]]\nkind = \"delay\"\n{fault}\n"), "x").unwrap();
             fault_that_is_off(&document, &format!("fault.0.{key}")).is_some()

@@ -8,7 +8,7 @@ use crate::config::{Checks, Document, Place};
 use serde::{Deserialize, Serialize};
 use toml::Value;
 
-/// The most values of one axis.
+/// Upper bound on the values of one axis.
 const MAX_POINTS: u64 = 1_000_000;
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -55,22 +55,22 @@ fn is_false(flag: &bool) -> bool {
     !flag
 }
 
-/// An axis, ready to be asked.
+/// A checked axis.
 #[derive(Debug, Clone)]
 pub(super) struct Varied {
     pub axis: Axis,
-    /// Whether its values are factors of what the scenario has.
+    /// True if its values are factors of the scenario's value.
     pub factor: bool,
-    /// Where the campaign names it.
+    /// Its place in the campaign's file.
     pub place: Place,
     spread: Spread,
 }
 
-/// How values are spread.
+/// The distribution of the values.
 #[derive(Debug, Clone)]
 enum Spread {
     Values(Vec<Value>),
-    /// Without points, it is drawn from.
+    /// Without points, values are drawn from the range.
     Range {
         ends: [f64; 2],
         points: Option<u64>,
@@ -84,7 +84,7 @@ enum Spread {
     },
 }
 
-/// A number, and whether it is a whole one.
+/// Returns a number, and true if it is an integer.
 pub(super) fn number(value: &Value) -> Option<(f64, bool)> {
     match value {
         Value::Integer(number) => Some((*number as f64, true)),
@@ -94,25 +94,25 @@ pub(super) fn number(value: &Value) -> Option<(f64, bool)> {
 }
 
 impl Varied {
-    /// Checks an axis; none if it was refused.
+    /// Checks an axis; `None` if it is refused.
     pub fn resolve(raw: &RawAxis, index: usize, document: &Document, checks: &mut Checks<'_>) -> Option<Self> {
         let at = format!("axis[{index}]");
         let given = [raw.values.is_some(), raw.range.is_some(), raw.random.is_some()];
-        let one = given.iter().filter(|given| **given).count() == 1;
-        checks.require(one, &at, "conflicting-keys", || {
-            "takes its values from one of values, range and random; give one of them".to_owned()
+        let single = given.iter().filter(|given| **given).count() == 1;
+        checks.require(single, &at, "conflicting-keys", || {
+            "needs exactly one of values, range and random; give one of them".to_owned()
         });
         checks.require(!raw.key.trim().is_empty(), &format!("{at}.key"), "empty-key", || {
             "is empty; name a key of the scenario, as --set does".to_owned()
         });
         let spread = match (&raw.values, &raw.range, &raw.random) {
-            _ if !one => return None,
+            _ if !single => return None,
             (Some(values), ..) => Spread::values(values, raw.names.as_deref(), &at, checks)?,
             (_, Some(range), _) => Spread::range(range, &format!("{at}.range"), checks)?,
             (.., random) => Spread::random(random.as_ref()?, &format!("{at}.random"), checks)?,
         };
         checks.require(raw.names.is_none() || raw.values.is_some(), &format!("{at}.names"), "unused-key", || {
-            "are names of values, and there is no list of these; remove it".to_owned()
+            "name the values of a list, and there is no list; remove them".to_owned()
         });
         let mut varied = Self {
             axis: Axis {
@@ -127,7 +127,7 @@ impl Varied {
         };
         let numbers = (0..varied.points().unwrap_or(0)).all(|point| number(&varied.at(point)).is_some());
         checks.require(!raw.factor || numbers, &format!("{at}.factor"), "not-a-number", || {
-            "factors are numbers, and some value is none; give numbers, or remove it".to_owned()
+            "needs numbers, and some value is not one; give numbers, or remove it".to_owned()
         });
         let named = |point: u64| match raw.names.as_ref().and_then(|names| names.get(point as usize)) {
             Some(name) => Parameter::Word(name.clone()),
@@ -137,7 +137,7 @@ impl Varied {
         Some(varied)
     }
 
-    /// How many values it has; none where they are drawn.
+    /// Returns the number of values; `None` if they are drawn.
     pub fn points(&self) -> Option<u64> {
         match &self.spread {
             Spread::Values(values) => Some(values.len() as u64),
@@ -146,7 +146,7 @@ impl Varied {
         }
     }
 
-    /// The value of this number, where values are not drawn.
+    /// Returns the value of this index, if values are not drawn.
     pub fn at(&self, point: u64) -> Value {
         match &self.spread {
             Spread::Values(values) => values[point as usize].clone(),
@@ -158,7 +158,7 @@ impl Varied {
         }
     }
 
-    /// The value that belongs to a number in (0, 1), and its position if it has one.
+    /// Returns the value for a number in (0, 1), and its index if it has one.
     pub fn drawn(&self, unit: f64) -> (Value, Option<u64>) {
         if let Some(points) = self.points() {
             let point = ((unit * points as f64) as u64).min(points - 1);
@@ -175,13 +175,13 @@ impl Varied {
         (drawn, None)
     }
 
-    /// The parameter that a value is shown as.
+    /// Returns the parameter that tables show for a value.
     pub fn shown(&self, value: &Value, point: Option<u64>) -> Parameter {
         let known = point.and_then(|point| self.axis.values.get(point as usize));
         known.cloned().unwrap_or_else(|| parameter(value))
     }
 
-    /// What lies at a part of the way from one end of the range to the other; the ends are met exactly.
+    /// Returns the value at a fraction of the range; 0 and 1 give its ends exactly.
     fn between(&self, part: f64) -> Value {
         let Spread::Range { ends: [from, to], log, whole, .. } = &self.spread else { return Value::Boolean(false) };
         let number = match part {
@@ -207,13 +207,19 @@ impl Spread {
     fn values(values: &[Value], names: Option<&[String]>, at: &str, checks: &mut Checks<'_>) -> Option<Self> {
         let enough = (1..=MAX_POINTS as usize).contains(&values.len());
         checks.require(enough, &format!("{at}.values"), "out-of-range", || {
-            format!("{} values are no axis; give 1 to {MAX_POINTS}", values.len())
+            format!("has {} values; give 1 to {MAX_POINTS}", values.len())
         });
         checks.require(
             names.is_none_or(|names| names.len() == values.len()),
             &format!("{at}.names"),
             "wrong-length",
-            || format!("{} names are not one for each of {} values", names.map_or(0, <[_]>::len), values.len()),
+            || {
+                format!(
+                    "has {} names for {} values; give one for each value",
+                    names.map_or(0, <[_]>::len),
+                    values.len()
+                )
+            },
         );
         enough.then(|| Self::Values(values.to_vec()))
     }
@@ -225,17 +231,12 @@ impl Spread {
             points.is_none_or(|points| (2..=MAX_POINTS).contains(&points)),
             &format!("{at}.points"),
             "out-of-range",
-            || {
-                format!(
-                    "{} is no number of points from one end to the other; give 2 to {MAX_POINTS}",
-                    points.unwrap_or(0)
-                )
-            },
+            || format!("{} points do not reach from one end to the other; give 2 to {MAX_POINTS}", points.unwrap_or(0)),
         );
         let steps = points.unwrap_or(2).saturating_sub(1).max(1) as f64;
         let even = !whole || raw.log || points.is_none() || ((ends[1] - ends[0]) / steps).fract() == 0.0;
         checks.require(even, &format!("{at}.points"), "uneven-steps", || {
-            "whole numbers are not so many even steps apart; give another number of points, or numbers as 1.0"
+            "does not divide the range into integer steps; give another number of points, or ends such as 1.0"
                 .to_owned()
         });
         Some(Self::Range { ends, points: points.map(|points| points.clamp(2, MAX_POINTS)), log: raw.log, whole })
@@ -264,7 +265,7 @@ impl Spread {
                 checks.refuse(
                     at,
                     "conflicting-keys",
-                    "follows one distribution; give one of uniform, log_uniform and normal",
+                    "needs exactly one of uniform, log_uniform and normal; give one of them",
                 );
                 None
             }
@@ -272,25 +273,25 @@ impl Spread {
     }
 }
 
-/// The ends of a range, and whether they are whole numbers.
+/// Returns the ends of a range, and true if both are integers.
 pub(super) fn ends(given: [&Value; 2], at: &str, log: bool, checks: &mut Checks<'_>) -> Option<([f64; 2], bool)> {
     let [Some((from, whole)), Some((to, also))] = given.map(number) else {
-        checks.refuse(at, "wrong-length", "goes from a number to a number; give two");
+        checks.refuse(at, "wrong-length", "needs a number at each end; give two numbers");
         return None;
     };
     checks.require(from < to, at, "wrong-order", || format!("{from} is not below {to}; give the lower end first"));
     checks.require(!log || from > 0.0, at, "not-positive", || {
-        format!("no factor leads from {from} upwards; give ends above zero")
+        format!("starts at {from}, and a logarithmic range needs positive ends; give ends above zero")
     });
     Some(([from, to], whole && also)).filter(|_| from < to && (!log || from > 0.0))
 }
 
-/// A number as a scenario has it.
+/// Returns a number as a scenario's value.
 pub(super) fn value(number: f64, whole: bool) -> Value {
     if whole { Value::Integer(number.round() as i64) } else { Value::Float(number) }
 }
 
-/// A value as tables show it.
+/// Returns a value as tables show it.
 pub(super) fn parameter(value: &Value) -> Parameter {
     match value {
         Value::Boolean(flag) => Parameter::Flag(*flag),

@@ -1,6 +1,6 @@
-//! One piece of a campaign's work: a case is run, or a point of a margin searched. Anybody may do any piece, anywhere.
+//! One work item of a campaign: a case to run, or a point of a margin to search. Any process may do any item.
 //!
-//! Must not fail: what cannot be run is a row that says why.
+//! Must not fail: a case that cannot run becomes a row with the reason.
 
 use super::file::{Campaign, Case, resolved};
 use super::journal::Entry;
@@ -13,32 +13,32 @@ use crate::scenario::claims;
 use std::sync::atomic::AtomicUsize;
 use toml::Value;
 
-/// What came of a scenario.
+/// The result of running a scenario.
 pub(super) enum Ran {
-    /// It was run.
+    /// The run ended.
     Ended(Box<(Scenario, Outcome)>),
-    /// It is none.
+    /// The scenario is invalid.
     Invalid(ConfigError),
-    /// It could not be run.
+    /// The run could not start.
     Failed(launch::LaunchError),
 }
 
 impl Campaign {
-    /// Runs a case; none if there is none of this number, or if `signal` asked for the end before the case's. Under every clock that
-    /// loses no sample the row is the same.
+    /// Runs a case; `None` if the number is out of range, or if `signal` interrupted it. The row is the same under every clock
+    /// that loses no sample.
     pub fn run(&self, number: u64, clock: ClockKind, signal: &AtomicUsize) -> Option<Row> {
         let case = self.case(number)?;
         let ran = run(self.document(&case), clock, signal)?;
         Some(self.row(&case, &ran))
     }
 
-    /// How many pieces of work there are: every case, and then every point of every margin.
+    /// Returns the number of work items: all cases, then all points of all margins.
     pub fn pieces(&self) -> u64 {
         self.cases() + self.margins().iter().map(|searched| self.points(searched)).sum::<u64>()
     }
 
-    /// Does a piece of work, anywhere: what comes of it is [collected](Self::collect). None if there is none of this number,
-    /// or if `signal` asked for the end before its own.
+    /// Does a work item; [`collect`](Self::collect) takes its result. `None` if the number is out of range, or if `signal`
+    /// interrupted it.
     pub fn work(&self, piece: u64, clock: ClockKind, signal: &AtomicUsize) -> Option<Entry> {
         let Some(mut point) = piece.checked_sub(self.cases()) else {
             return self.run(piece, clock, signal).map(Entry::Row);
@@ -54,7 +54,7 @@ impl Campaign {
         None
     }
 
-    /// The piece of work that an entry tells of, if it is one of this campaign's.
+    /// Returns the work item of an entry, if it belongs to this campaign.
     pub(super) fn piece(&self, entry: &Entry) -> Option<u64> {
         match entry {
             Entry::Row(row) => Some(row.case).filter(|case| *case < self.cases()),
@@ -105,11 +105,11 @@ impl Campaign {
             Some(incident) => (End::Stopped, Some(incident.to_string())),
             None if !books.balanced => (End::Failed, Some(books.problems.join("; "))),
             None if score.faulted_ticks > 0 => {
-                (End::Lost, Some(format!("a body came to the end of its model: lost at {} ticks", score.faulted_ticks)))
+                (End::Lost, Some(format!("a body left the range of its model: lost at {} ticks", score.faulted_ticks)))
             }
             None => (End::Completed, None),
         };
-        let ticks = |of: fn(&crate::telemetry::Ticks) -> u64| books.roles.values().map(of).sum();
+        let ticks = |count: fn(&crate::telemetry::Ticks) -> u64| books.roles.values().map(count).sum();
         Row {
             accepted,
             verdict,
@@ -130,7 +130,7 @@ impl Campaign {
     }
 }
 
-/// Runs a scenario that was made; none if `signal` asked for the end before its own.
+/// Runs the scenario of a case; `None` if `signal` interrupted it.
 fn run(document: Result<Document, ConfigError>, clock: ClockKind, signal: &AtomicUsize) -> Option<Ran> {
     let scenario = match document.and_then(|document| resolved(document, clock)) {
         Ok(scenario) => scenario,
@@ -145,7 +145,7 @@ fn run(document: Result<Document, ConfigError>, clock: ClockKind, signal: &Atomi
     }
 }
 
-/// When the last metric that has a limit came within it for good; none if one never did, or none has one.
+/// Returns the time at which the last metric with a limit settled; `None` if one did not settle, or if no metric has a limit.
 fn settled_at_s(scenario: &Scenario, metrics: &[MetricScore]) -> Option<f64> {
     let limited = metrics.iter().filter(|metric| scenario.accept.metric_max.contains_key(&metric.name));
     let times: Option<Vec<f64>> = limited.map(|metric| metric.settled_at_s).collect();
@@ -163,7 +163,7 @@ fn value(metric: &Metric, scores: &[MetricScore]) -> Option<f64> {
     value.filter(|value| value.is_finite())
 }
 
-/// The slowest rate that is claimed of the loop; none if there is a body of which none is.
+/// Returns the slowest proven rate of the loop; `None` if it is not proven for some body.
 fn predicted_rate_per_s(scenario: &Scenario) -> Option<f64> {
     let rates: Option<Vec<f64>> = claims(scenario).iter().map(|claim| claim.loop_rate_per_s).collect();
     rates?.into_iter().reduce(f64::min)

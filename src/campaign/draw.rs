@@ -1,14 +1,14 @@
 //! Numbers in (0, 1) that follow from a seed, an axis and a number, and from nothing else: independent, in a latin hypercube, or
 //! of Sobol's sequence.
 //!
-//! Nothing is remembered from one draw to the next, so any case can be drawn alone. Must not depend on the machine: no function
+//! Draws have no state, so any case can be drawn alone. Must not depend on the machine: no function
 //! of its mathematical library is called.
 
 use crate::fault::{mix, unit};
 
-/// The most dimensions of Sobol's sequence here.
+/// Upper bound on the dimensions of Sobol's sequence.
 pub(super) const SOBOL_AXES: usize = 16;
-/// The most points of it.
+/// Upper bound on its points.
 pub(super) const SOBOL_POINTS: u64 = 1 << 32;
 /// Bits of a coordinate.
 const BITS: usize = 32;
@@ -34,42 +34,42 @@ const DIRECTIONS: [(usize, u32, [u32; 6]); SOBOL_AXES - 1] = [
     (6, 16, [1, 3, 1, 13, 27, 49]),
 ];
 
-/// What draws of one axis follow from.
+/// Returns the seed of the draws of one axis.
 fn stream(seed: u64, axis: usize) -> u64 {
     mix(seed ^ (axis as u64 + 1).rotate_left(48))
 }
 
-/// An independent number in (0, 1).
+/// Returns an independent number in (0, 1).
 pub(super) fn independent(seed: u64, axis: usize, number: u64) -> f64 {
     inside(unit(mix(stream(seed, axis) ^ number)))
 }
 
-/// The number of one sample of `count` in a latin hypercube: of each axis there is one in each of `count` equal parts.
+/// Returns the number of one of `count` samples in a latin hypercube: each axis has one sample in each of `count` equal parts.
 pub(super) fn latin_hypercube(seed: u64, axis: usize, sample: u64, count: u64) -> f64 {
     let part = permuted(mix(stream(seed, axis)), sample, count);
     inside((part as f64 + independent(seed, axis, sample)) / count as f64)
 }
 
-/// The number of one point of Sobol's sequence, shifted digit by digit as the seed says: the shift keeps its evenness, and takes
-/// it away from the corner at which it begins.
+/// Returns one point of Sobol's sequence with a digital shift by the seed, which keeps its evenness and moves it away from the
+/// corner at which it begins.
 pub(super) fn sobol(seed: u64, axis: usize, sample: u64) -> f64 {
     let shift = (stream(seed, axis) >> BITS) as u32;
     inside((f64::from(coordinate(axis, sample as u32) ^ shift) + 0.5) / SOBOL_POINTS as f64)
 }
 
-/// Away from 0 and 1, where a distribution may have no end.
+/// Keeps a number away from 0 and 1, where a quantile may be infinite.
 fn inside(number: f64) -> f64 {
     number.clamp(f64::EPSILON / 4.0, 1.0 - f64::EPSILON / 2.0)
 }
 
-/// A coordinate of a point of Sobol's sequence, times 2³², in the order of the Gray code.
+/// Returns a coordinate of a point of Sobol's sequence, times 2³², in Gray-code order.
 fn coordinate(axis: usize, point: u32) -> u32 {
     let code = point ^ point >> 1;
     let numbers = directions(axis);
     (0..BITS).filter(|bit| code >> bit & 1 == 1).fold(0, |sum, bit| sum ^ numbers[bit])
 }
 
-/// The direction numbers of an axis.
+/// Returns the direction numbers of an axis.
 fn directions(axis: usize) -> [u32; BITS] {
     let mut numbers = [0; BITS];
     let Some(&(degree, coefficients, first)) = axis.checked_sub(1).and_then(|row| DIRECTIONS.get(row)) else {
@@ -88,8 +88,8 @@ fn directions(axis: usize) -> [u32; BITS] {
     numbers
 }
 
-/// Where a number below `count` goes in a permutation of all of them: a Feistel network on the next even number of bits, walked
-/// until it comes back into the range.
+/// Returns the image of a number below `count` in a permutation: a Feistel network on the next even number of bits, repeated
+/// until the result is in the range.
 fn permuted(key: u64, number: u64, count: u64) -> u64 {
     let half = (u64::BITS - count.saturating_sub(1).leading_zeros()).div_ceil(2).max(1);
     let mask = (1 << half) - 1;
@@ -106,8 +106,8 @@ fn permuted(key: u64, number: u64, count: u64) -> u64 {
     }
 }
 
-/// The quantile of the standard normal distribution: a first guess (M. Abramowitz, I. A. Stegun, 26.2.23), mended by Halley's
-/// method until rounding is all that is left.
+/// Returns the quantile of the standard normal distribution: an approximation (M. Abramowitz, I. A. Stegun, 26.2.23), refined
+/// by Halley's method to rounding.
 pub(super) fn normal(probability: f64) -> f64 {
     let tail = probability.min(1.0 - probability);
     let t = libm::sqrt(-2.0 * libm::log(tail));
@@ -188,7 +188,7 @@ mod tests {
         }
 
         #[test]
-        fn a_permutation_is_one(key: u64, count in 1..3000_u64) {
+        fn a_permutation_meets_every_number_once(key: u64, count in 1..3000_u64) {
             let mut met = vec![false; count as usize];
             (0..count).for_each(|number| met[permuted(key, number, count) as usize] = true);
             prop_assert!(met.iter().all(|met| *met));

@@ -1,4 +1,4 @@
-//! Why a campaign has no results, or cannot go on.
+//! The error of a campaign.
 
 use super::journal::JournalError;
 use crate::config::ConfigError;
@@ -6,7 +6,7 @@ use crate::system::remedy;
 use std::io;
 use std::path::PathBuf;
 
-/// Why a campaign has no results, or cannot go on.
+/// The reason why a campaign has no results, or cannot continue.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum SweepError {
@@ -19,7 +19,7 @@ pub enum SweepError {
     #[strum(serialize = "refused-scenario")]
     Config(#[from] ConfigError),
     /// The directory holds something else.
-    #[error("{} is not empty, and no campaign's; name another directory with --out", path.display())]
+    #[error("{} is not empty and holds no campaign; name another directory with --out", path.display())]
     #[strum(serialize = "not-a-campaign")]
     Foreign {
         /// The directory.
@@ -34,30 +34,30 @@ pub enum SweepError {
         /// The system's reason.
         source: io::Error,
     },
-    /// Directories that are to be merged are not of one campaign.
-    #[error("{} holds another campaign than {}, or another build's; merge what belongs together", other.display(), first.display())]
+    /// Directories to merge belong to different campaigns.
+    #[error("{} and {} hold different campaigns or builds; merge the shards of one campaign and build", path.display(), first.display())]
     #[strum(serialize = "mixed-campaigns")]
     Mixed {
-        /// The first.
+        /// The first directory.
         first: PathBuf,
-        /// The one that does not belong to it.
-        other: PathBuf,
+        /// The directory that differs.
+        path: PathBuf,
     },
-    /// Pieces of work are missing.
+    /// Work items are missing.
     #[error(
-        "{count} of {all} cases and points of margins are missing, number {first} first; run the shards to their end, and name them all"
+        "{count} of {all} cases and margin points are missing, the first is number {first}; complete all shards, and name them all"
     )]
     #[strum(serialize = "missing-cases")]
     Missing {
-        /// How many.
+        /// The number of missing items.
         count: u64,
-        /// Of how many.
+        /// The number of all items.
         all: u64,
-        /// The first, of the cases and then of the points of margins.
+        /// The first missing item; margin points follow the cases.
         first: u64,
     },
-    /// Two directories tell different things of one case.
-    #[error("{}: its case {case} is another than that of a directory before it; do both machines have the same processor?", path.display())]
+    /// Two directories hold different results of one case.
+    #[error("{}: case {case} differs from the result in another directory; run all shards on processors of one architecture", path.display())]
     #[strum(serialize = "cases-disagree")]
     Disagree {
         /// The directory.

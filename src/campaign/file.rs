@@ -1,6 +1,6 @@
-//! Campaign files: text as typed, then a [`Campaign`] as resolved, of which any case can be asked.
+//! Campaign files: text as typed, then a [`Campaign`] as resolved, which yields any case.
 //!
-//! Every error says where (file, line, key), why, and what to do. Must not run anything.
+//! Every error names file, line and key, the reason and the remedy. Must not run anything.
 
 use super::apply::{EVERY, fault_that_is_off, put};
 use super::axis::{RawAxis, Varied};
@@ -17,18 +17,18 @@ use std::path::Path;
 use toml::Value;
 use xxhash_rust::xxh3::xxh3_64;
 
-/// The most cases of a campaign.
+/// Upper bound on the cases of a campaign.
 const MAX_CASES: u64 = 1_000_000_000;
-/// Of so many cases one must be valid.
+/// Number of cases of which one must be valid.
 const TRIED: u64 = 64;
-/// Bits of a case's seed: every program that reads tables has numbers of so many.
+/// Bits of a case's seed: every program that reads tables can represent them.
 pub(super) const SEED_BITS: u32 = 53;
-/// The table of a campaign that has its scenario in it.
+/// The table of a campaign that contains its scenario.
 const SCENARIO: &str = "scenario";
-/// Gives the text of a shipped scenario by its name, or says that there is none.
+/// Returns the text of the shipped scenario of a name, or an error.
 pub type Shipped<'a> = &'a dyn Fn(&str) -> Result<Cow<'static, str>, ConfigError>;
 
-/// A campaign: a scenario, what is varied of it, and how.
+/// A campaign: a scenario, its varied keys, and their values.
 #[derive(Debug, Clone)]
 pub struct Campaign {
     name: String,
@@ -45,10 +45,10 @@ pub struct Campaign {
     resolved: String,
 }
 
-/// One case: its number, and what follows from that.
+/// One case: its number, seed and values.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Case {
-    /// From 0.
+    /// The number, from 0.
     pub number: u64,
     /// The scenario's seed.
     pub seed: u64,
@@ -57,7 +57,7 @@ pub struct Case {
     values: Vec<Value>,
 }
 
-/// How samples are drawn.
+/// The method by which samples are drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Sampling {
@@ -72,9 +72,9 @@ pub(super) enum Sampling {
 pub(super) struct Raw {
     name: String,
     base: String,
-    #[serde(default = "one")]
+    #[serde(default = "default_one")]
     pub seed: u64,
-    #[serde(default = "one")]
+    #[serde(default = "default_one")]
     repeats: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples: Option<u64>,
@@ -88,35 +88,39 @@ pub(super) struct Raw {
     margin: Vec<RawMargin>,
 }
 
-fn one() -> u64 {
+fn default_one() -> u64 {
     1
 }
 
-/// Whether a document is a campaign's, and no scenario's.
+/// Returns true if a document is a campaign, not a scenario.
 pub(crate) fn is_campaign(document: &Document) -> bool {
     document.has("base") && !document.has("rig")
 }
 
 impl Campaign {
-    /// Reads a file; scenarios that it names by a path lie beside it.
+    /// Reads a file; paths of scenarios in it are relative to its directory.
     ///
     /// # Errors
     /// [`ConfigError`], with the place, the reason and the remedy.
     pub fn load(path: &Path, overrides: &[String], shipped: Shipped<'_>) -> Result<Self, ConfigError> {
-        Self::of(Document::read(path)?, overrides, shipped)
+        Self::from_document(Document::read(path)?, overrides, shipped)
     }
 
-    /// The same from a text; `origin` stands for the file in error messages.
+    /// Like [`load`](Self::load), from a text; `origin` stands for the file in error messages.
     ///
     /// # Errors
     /// [`ConfigError`].
     pub fn parse(text: &str, origin: &str, overrides: &[String], shipped: Shipped<'_>) -> Result<Self, ConfigError> {
-        Self::of(Document::parse(text, origin)?, overrides, shipped)
+        Self::from_document(Document::parse(text, origin)?, overrides, shipped)
     }
 
-    /// The same from a document; `overrides` are of the scenario, as `--set` has them.
-    pub(crate) fn of(mut file: Document, overrides: &[String], shipped: Shipped<'_>) -> Result<Self, ConfigError> {
-        // What belongs to the scenario is read by whoever reads scenarios.
+    /// Like [`load`](Self::load), from a document; `overrides` change the scenario, as `--set` does.
+    pub(crate) fn from_document(
+        mut file: Document,
+        overrides: &[String],
+        shipped: Shipped<'_>,
+    ) -> Result<Self, ConfigError> {
+        // The scenario's part is checked with the scenario.
         let (inner, set) = (file.take(SCENARIO), file.take("set"));
         let mut faults = file.split_off(&["fault"]);
         let raw: Raw = file.read_into()?;
@@ -171,10 +175,10 @@ impl Campaign {
         Ok(campaign)
     }
 
-    /// The metrics of the first of some cases that is valid.
+    /// Returns the metrics of the first valid case among some.
     ///
     /// # Errors
-    /// That of the first case, if none is: then a key does not exist, or no case would run.
+    /// The error of the first case, if all are invalid: a key does not exist, or no case would run.
     fn try_cases(&self) -> Result<Vec<Metric>, ConfigError> {
         let tried = self.cases.min(TRIED);
         let mut first = None;
@@ -189,23 +193,23 @@ impl Campaign {
         Err(first.expect("a campaign has a case"))
     }
 
-    /// The same with other axes, of which so many samples are drawn.
+    /// Returns the campaign with other axes and samples.
     #[cfg(test)]
     pub(super) fn with_axes(self, axes: Vec<Varied>, samples: Option<(Sampling, u64)>, seed: u64) -> Self {
         Self { axes, samples, seed, cases: samples.map_or(self.cases, |(_, samples)| samples), ..self }
     }
 
-    /// Its name.
+    /// Returns the name.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// How many cases it has.
+    /// Returns the number of cases.
     pub fn cases(&self) -> u64 {
         self.cases
     }
 
-    /// Whether the certificate's rate is predicted for every case.
+    /// Returns true if the proven rate is computed for every case.
     pub(super) fn rate(&self) -> bool {
         self.rate
     }
@@ -218,17 +222,17 @@ impl Campaign {
         &self.margins
     }
 
-    /// The campaign as a file that resolves to itself: with its scenario in it.
+    /// Returns the campaign as a file that contains its scenario and resolves to itself.
     pub fn to_toml(&self) -> &str {
         &self.resolved
     }
 
-    /// What its cases follow from, as a hash: the same for the same campaign, whatever its file is called.
+    /// Returns a hash of everything that determines the cases; the name of the file does not.
     pub fn identity(&self) -> String {
         format!("{:016x}", xxh3_64(self.resolved.as_bytes()))
     }
 
-    /// Its table without rows.
+    /// Returns the table without rows.
     pub fn table(&self) -> Table {
         Table {
             name: self.name.clone(),
@@ -241,7 +245,7 @@ impl Campaign {
         }
     }
 
-    /// A case; none if there is none of this number.
+    /// Returns a case; `None` if the number is out of range.
     pub fn case(&self, number: u64) -> Option<Case> {
         if number >= self.cases {
             return None;
@@ -271,8 +275,8 @@ impl Campaign {
         Some(Case { number, seed, parameters, values })
     }
 
-    /// The case at a point of a margin, of [`points`](Self::points) there are: that with the first value of the key, if it is an
-    /// axis.
+    /// Returns the case at one of the [`points`](Self::points) of a margin: the one with the first value of the key, if the key is
+    /// an axis.
     pub(super) fn case_at(&self, searched: &Searched, point: u64) -> Option<Case> {
         let moved = searched.axis.filter(|_| self.samples.is_none());
         let number = moved.map_or(point, |moved| {
@@ -282,7 +286,7 @@ impl Campaign {
         self.case(number)
     }
 
-    /// The point of a margin that a case stands for.
+    /// Returns the point of a margin that a case represents.
     pub(super) fn point(&self, searched: &Searched, case: u64) -> Option<u64> {
         let Some(moved) = searched.axis.filter(|_| self.samples.is_none()) else {
             return Some(case).filter(|case| *case < self.cases);
@@ -292,23 +296,23 @@ impl Campaign {
         Some(case / round * stride + case % stride).filter(|_| case < self.cases && case % round < stride)
     }
 
-    /// How many cases lie between two values of an axis, where all combinations are run.
+    /// Returns the number of cases between two values of an axis, if all combinations run.
     fn stride(&self, axis: usize) -> u64 {
         self.axes[axis + 1..].iter().map(|axis| axis.points().unwrap_or(1)).product::<u64>() * self.repeats
     }
 
-    /// How many points a margin has.
+    /// Returns the number of points of a margin.
     pub(super) fn points(&self, searched: &Searched) -> u64 {
         let moved = searched.axis.filter(|_| self.samples.is_none());
         self.cases / moved.and_then(|moved| self.axes[moved].points()).unwrap_or(1)
     }
 
-    /// The scenario of a case, as a document: what is varied has its values.
+    /// Returns the scenario of a case as a document with the values of the axes.
     pub(crate) fn document(&self, case: &Case) -> Result<Document, ConfigError> {
         self.document_with(case, None)
     }
 
-    /// The same with a margin's key at a value.
+    /// Like [`document`](Self::document), with a margin's key at a value.
     pub(super) fn document_with(
         &self,
         case: &Case,
@@ -334,23 +338,23 @@ impl Campaign {
         Ok(document)
     }
 
-    /// The scenario of a case, to be run in one thread.
+    /// Returns the scenario of a case, to run in one thread.
     ///
     /// # Errors
-    /// [`ConfigError`] where the values make no scenario.
+    /// [`ConfigError`] if the values make an invalid scenario.
     pub fn scenario(&self, case: &Case) -> Result<Scenario, ConfigError> {
         resolved(self.document(case)?, ClockKind::InProcess)
     }
 }
 
-/// The scenario of a document under a clock, whatever its own is; nothing is recorded.
+/// Resolves a document under a clock that replaces its own; nothing is recorded.
 pub(super) fn resolved(mut document: Document, clock: ClockKind) -> Result<Scenario, ConfigError> {
     document.put("clock", clock.name().into(), &"a campaign's clock".into())?;
     document.put("record", false.into(), &"a campaign records nothing".into())?;
     Scenario::resolve(document)
 }
 
-/// The scenario that a campaign varies.
+/// Returns the scenario that a campaign varies.
 fn base(name: &str, file: &Document, shipped: Shipped<'_>) -> Result<Document, ConfigError> {
     let refuse = |code, reason: String| ConfigError::invalid(file.place("base"), "base", code, reason);
     if is_name(name) {
@@ -364,7 +368,7 @@ fn base(name: &str, file: &Document, shipped: Shipped<'_>) -> Result<Document, C
     Document::parse(&read_text(text, &path)?, &path.display().to_string())
 }
 
-/// Puts every value of a table of changes where its path says.
+/// Puts every value of a table of changes at its path.
 fn merge(document: &mut Document, set: &Document) -> Result<(), ConfigError> {
     fn put(document: &mut Document, set: &Document, table: &toml::Table, path: &str) -> Result<(), ConfigError> {
         for (key, value) in table {
@@ -379,23 +383,23 @@ fn merge(document: &mut Document, set: &Document) -> Result<(), ConfigError> {
     put(document, set, set.table(), "")
 }
 
-/// The campaign as a file that needs no other.
+/// Returns the campaign as a file that needs no other.
 fn text(raw: &Raw, document: &Document) -> String {
     let mut table = toml::Table::try_from(raw).expect("a campaign of plain values is TOML");
     table.insert(SCENARIO.to_owned(), Value::Table(document.table().clone()));
     toml::to_string(&table).expect("a campaign of plain values is TOML")
 }
 
-/// The columns that a scenario's metrics make.
+/// Returns the columns of a scenario's metrics.
 fn metrics(scenario: &Scenario) -> Vec<Metric> {
-    let of = |metric: &'static str| {
+    let columns = |metric: &'static str| {
         Statistic::ALL.map(|statistic| Metric {
             name: format!("{metric}.{}", statistic.name()),
             metric: metric.to_owned(),
             statistic,
         })
     };
-    scenario.rig.metrics().into_iter().flat_map(of).collect()
+    scenario.rig.metrics().into_iter().flat_map(columns).collect()
 }
 
 fn check(raw: &Raw, checks: &mut Checks<'_>) {
@@ -405,19 +409,19 @@ fn check(raw: &Raw, checks: &mut Checks<'_>) {
         format!("`{}` cannot name files; use 1 to 32 of a-z, 0-9 and -", raw.name)
     });
     checks.require((1..=MAX_CASES).contains(&raw.repeats), "repeats", "out-of-range", || {
-        format!("{} is no number of runs of one point; give 1 to {MAX_CASES}", raw.repeats)
+        format!("{} is out of range; give 1 to {MAX_CASES} runs per point", raw.repeats)
     });
     let samples = raw.samples.unwrap_or(1);
     checks.require((1..=MAX_CASES).contains(&samples), "samples", "out-of-range", || {
-        format!("{samples} are no samples; give 1 to {MAX_CASES}, or leave it out for all combinations")
+        format!("{samples} is out of range; give 1 to {MAX_CASES} samples, or leave it out for all combinations")
     });
     checks.require(raw.sampling.is_none() || raw.samples.is_some(), "sampling", "unused-key", || {
-        "says how samples are drawn, and all combinations are run; add samples = N, or remove it".to_owned()
+        "needs samples, and all combinations are run; add samples = N, or remove it".to_owned()
     });
     if raw.sampling == Some(Sampling::Sobol) {
         checks.require(raw.axis.len() <= SOBOL_AXES, "sampling", "too-many-axes", || {
             format!(
-                "Sobol's sequence has {SOBOL_AXES} axes here, and there are {}; take latin-hypercube",
+                "Sobol's sequence supports {SOBOL_AXES} axes, and there are {}; use latin-hypercube",
                 raw.axis.len()
             )
         });
@@ -425,27 +429,28 @@ fn check(raw: &Raw, checks: &mut Checks<'_>) {
     }
 }
 
-/// No key may be varied twice, nor be put where another has been varied: what lies in a table comes after the table.
+/// Checks that no key is varied twice, and that an axis of a table precedes the axes of its keys.
 fn check_keys(raw: &Raw, checks: &mut Checks<'_>) {
     for (index, axis) in raw.axis.iter().enumerate() {
-        let covers = |other: &&RawAxis| format!("{}.", other.key.trim()).starts_with(&format!("{}.", axis.key.trim()));
+        let covers =
+            |earlier: &&RawAxis| format!("{}.", earlier.key.trim()).starts_with(&format!("{}.", axis.key.trim()));
         let key = format!("axis[{index}].key");
-        if let Some(other) = raw.axis[..index].iter().find(covers) {
+        if let Some(earlier) = raw.axis[..index].iter().find(covers) {
             checks.refuse(
                 &key,
                 "varied-twice",
-                format!("`{}` is varied already, by an axis before it; vary it after this", other.key),
+                format!("`{}` is varied by an earlier axis; move that axis after this one", earlier.key),
             );
         }
         let every = axis.key.trim().ends_with(EVERY);
         checks.require(!every || axis.factor, &key, "not-a-factor", || {
-            format!("`{}` is every number of a table, which have a factor in common; add factor = true", axis.key)
+            format!("`{}` stands for every number of a table, which needs factor = true; add it", axis.key)
         });
     }
 }
 
 impl Searched {
-    /// The parameters of a case that a margin leaves as they are.
+    /// Returns the parameters of a case that a margin does not move.
     pub(super) fn parameters(&self, case: &Case) -> Vec<Option<Parameter>> {
         let kept = case.parameters.iter().enumerate();
         kept.map(|(index, parameter)| (self.axis != Some(index)).then(|| parameter.clone())).collect()

@@ -1,7 +1,7 @@
-//! The journal of a campaign: a line per finished piece of work, written once and never changed.
+//! The journal of a campaign: one line per finished work item, written once and never changed.
 //!
-//! Every line begins with the hash of the rest, so that what a killed process left unfinished is known from what it finished:
-//! the journal ends before the first line that is not whole. Must not hold more of it than a line.
+//! Every line begins with the hash of its rest, which identifies lines that a killed process left incomplete: the journal ends
+//! before the first of these. Must not hold more than a line in memory.
 
 use super::table::{MarginPoint, Row, Table};
 use crate::files;
@@ -21,11 +21,11 @@ const SCHEMA: &str = "corotate/campaign/v1";
 /// Hexadecimal digits of the hash, and the space after them.
 const HASH: usize = 17;
 
-/// Why the results of a campaign cannot be read.
+/// The reason why the results of a campaign cannot be read or written.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum JournalError {
-    /// There is none, or it cannot be read.
+    /// The journal is missing or cannot be read.
     #[error("{}: {source}; {}", path.display(), remedy(source))]
     #[strum(serialize = "cannot-read")]
     Read {
@@ -34,7 +34,7 @@ pub enum JournalError {
         /// The system's reason.
         source: io::Error,
     },
-    /// It cannot be written.
+    /// The journal cannot be written.
     #[error("cannot write {}: {source}; {}", path.display(), remedy(source))]
     #[strum(serialize = "cannot-write")]
     Write {
@@ -43,26 +43,26 @@ pub enum JournalError {
         /// The system's reason.
         source: io::Error,
     },
-    /// Somebody else writes it.
-    #[error("{}: another sweep is at work there; wait for its end, or name another directory with --out", path.display())]
+    /// Another process writes the journal.
+    #[error("{}: another sweep writes this journal; wait until it ends, or name another directory with --out", path.display())]
     #[strum(serialize = "campaign-busy")]
     Busy {
         /// The file.
         path: PathBuf,
     },
-    /// It is another campaign's.
-    #[error("{}: holds {theirs}, and this is {ours}; name another directory with --out", path.display())]
+    /// The journal belongs to another campaign.
+    #[error("{}: holds {found}, and this is {expected}; name another directory with --out", path.display())]
     #[strum(serialize = "other-campaign")]
     Other {
         /// The file.
         path: PathBuf,
-        /// Whose it is.
-        theirs: String,
-        /// Who would write to it.
-        ours: String,
+        /// The campaign of the journal.
+        found: String,
+        /// The campaign to write.
+        expected: String,
     },
-    /// It does not begin as a journal does.
-    #[error("{}: is no campaign's journal, or of another version; name a directory that `corotate sweep` made", path.display())]
+    /// The file is not a journal of this version.
+    #[error("{}: is not a campaign's journal, or has another version; name a directory that `corotate sweep` made", path.display())]
     #[strum(serialize = "not-a-journal")]
     Foreign {
         /// The file.
@@ -70,15 +70,15 @@ pub enum JournalError {
     },
 }
 
-/// The first line: whose journal it is.
+/// The first line, which identifies the campaign.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Head {
     schema: String,
     version: String,
     revision: String,
-    /// What the cases follow from, as a hash.
+    /// The hash of everything that determines the cases.
     pub identity: String,
-    /// Which part of the cases it is, of how many; none for all.
+    /// Index and number of the shard; `None` for the whole campaign.
     pub shard: Option<[u64; 2]>,
     /// The table without rows.
     pub table: Table,
@@ -98,12 +98,12 @@ impl Head {
         }
     }
 
-    /// That of the whole campaign, of which this may be a part.
-    pub fn of_all(&self) -> Self {
+    /// Returns the head of the whole campaign, of which this may be a shard.
+    pub fn whole(&self) -> Self {
         Self { shard: None, ..self.clone() }
     }
 
-    /// Whose journal it is, in words.
+    /// Returns the campaign and build in words.
     fn words(&self) -> String {
         let shard = self.shard.map_or(String::new(), |[index, count]| format!("shard {index}/{count} of "));
         let Self { identity, version, revision, table, .. } = self;
@@ -111,7 +111,7 @@ impl Head {
     }
 }
 
-/// A finished piece of work, as a line of the journal has it.
+/// A finished work item, one line of the journal.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Entry {
@@ -126,13 +126,13 @@ pub enum Entry {
     },
 }
 
-/// A line with its hash and its end.
+/// Returns a line with its hash and line end.
 pub(super) fn line<T: Serialize>(content: &T) -> String {
     let text = serde_json::to_string(content).expect("plain values are JSON");
     format!("{:016x} {text}\n", xxh3_64(text.as_bytes()))
 }
 
-/// What a whole line says; none of any other.
+/// Returns the content of a complete line; `None` for any other.
 fn content<T: DeserializeOwned>(line: &[u8]) -> Option<T> {
     let text = line.strip_suffix(b"\n")?;
     let (hash, text) = text.split_at_checked(HASH)?;
@@ -140,13 +140,13 @@ fn content<T: DeserializeOwned>(line: &[u8]) -> Option<T> {
     serde_json::from_slice(text).ok().filter(|_| whole)
 }
 
-/// A journal that is read from its beginning.
+/// Reads a journal from its beginning.
 pub(super) struct Reader {
     path: PathBuf,
     file: BufReader<File>,
     head: Head,
     line: Vec<u8>,
-    /// Where the lines that are whole end, bytes.
+    /// The end of the complete lines, bytes.
     end: u64,
 }
 
@@ -168,7 +168,7 @@ impl Reader {
         &self.head
     }
 
-    /// The next line; none at the end, or before the first that is not whole.
+    /// Returns the next line; `None` at the end, or before the first incomplete line.
     pub fn next(&mut self) -> Result<Option<Entry>, JournalError> {
         self.line.clear();
         let read = self.file.read_until(b'\n', &mut self.line);
@@ -179,28 +179,28 @@ impl Reader {
     }
 }
 
-/// Where no line is.
+/// The offset of a missing line: the head is there.
 const NOWHERE: u64 = 0;
 
-/// A journal that is written. It is this process's alone as long as it is open.
+/// Writes a journal. No other process can write it meanwhile.
 pub(super) struct Journal {
     path: PathBuf,
     file: File,
-    /// Where the line of each piece of work is, bytes.
+    /// The offset of each work item's line, bytes.
     offsets: Vec<u64>,
     end: u64,
 }
 
 impl Drop for Journal {
     fn drop(&mut self) {
-        // Closing it is not enough: a process that was forked meanwhile has the file too.
+        // Closing is not enough: a child process may have inherited the file.
         let _ = self.file.unlock();
     }
 }
 
 impl Journal {
-    /// Begins a journal, or goes on with one that the same campaign began. `pieces` tells how many lines there will be, `place` which
-    /// of them an entry is.
+    /// Creates a journal, or continues one of the same campaign. `pieces` is the number of work items, `place` returns the item of
+    /// an entry.
     pub fn open(
         directory: &Path,
         head: &Head,
@@ -218,7 +218,7 @@ impl Journal {
             Ok(()) => {}
         }
         let first = line(head);
-        // Killed before the first line was whole.
+        // The writer was killed before the first line was complete.
         let begun =
             std::fs::read(&path).ok().filter(|_| file.metadata().is_ok_and(|file| file.len() < first.len() as u64));
         if begun.is_some_and(|begun| first.as_bytes().starts_with(&begun)) {
@@ -226,7 +226,7 @@ impl Journal {
         }
         let mut reader = Reader::open(directory)?;
         if reader.head() != head {
-            return Err(JournalError::Other { path, theirs: reader.head().words(), ours: head.words() });
+            return Err(JournalError::Other { path, found: reader.head().words(), expected: head.words() });
         }
         let mut offsets = vec![NOWHERE; pieces as usize];
         let mut end = reader.end;
@@ -236,22 +236,22 @@ impl Journal {
             }
             end = reader.end;
         }
-        // What is not whole is not there.
+        // An incomplete line is discarded.
         file.set_len(end).map_err(refuse)?;
         Ok(Self { path, file, offsets, end })
     }
 
-    /// Whether this piece of work is done.
+    /// Returns true if this work item is done.
     pub fn has(&self, place: u64) -> bool {
         self.offsets.get(place as usize).is_some_and(|offset| *offset != NOWHERE)
     }
 
-    /// How many pieces of work are done.
+    /// Returns the number of finished work items.
     pub fn done(&self) -> u64 {
         self.offsets.iter().filter(|offset| **offset != NOWHERE).count() as u64
     }
 
-    /// Writes a piece of work down: the whole line, at once.
+    /// Writes a finished work item: the whole line at once.
     pub fn add(&mut self, place: u64, entry: &Entry) -> Result<(), JournalError> {
         let line = line(entry);
         let written = self.file.write_all(line.as_bytes());
@@ -261,21 +261,21 @@ impl Journal {
         Ok(())
     }
 
-    /// What has been written of the pieces of work, in their order.
+    /// Returns the entries in the order of the work items.
     pub fn entries(&self) -> Result<impl Iterator<Item = Result<Entry, JournalError>> + '_, JournalError> {
         let mut lines = self.lines()?;
         let offsets = self.offsets.iter().filter(|offset| **offset != NOWHERE);
         Ok(offsets.map(move |offset| lines.at(*offset)))
     }
 
-    /// The lines of what has been written, in any order.
+    /// Returns random access to the entries.
     pub fn lines(&self) -> Result<Lines<'_>, JournalError> {
         let refuse = |source| JournalError::Read { path: self.path.clone(), source };
         Ok(Lines { journal: self, file: BufReader::new(File::open(&self.path).map_err(refuse)?), line: Vec::new() })
     }
 }
 
-/// A journal that is read where it is asked for.
+/// Random access to the entries of a journal.
 pub(super) struct Lines<'a> {
     journal: &'a Journal,
     file: BufReader<File>,
@@ -283,8 +283,8 @@ pub(super) struct Lines<'a> {
 }
 
 impl Lines<'_> {
-    /// What has been written of a piece of work.
-    pub fn of(&mut self, place: u64) -> Result<Option<Entry>, JournalError> {
+    /// Returns the entry of a work item, if it is done.
+    pub fn entry(&mut self, place: u64) -> Result<Option<Entry>, JournalError> {
         if self.journal.has(place) { self.at(self.journal.offsets[place as usize]).map(Some) } else { Ok(None) }
     }
 
@@ -298,12 +298,12 @@ impl Lines<'_> {
 }
 
 impl Table {
-    /// Whether a directory holds the results of a campaign.
+    /// Returns true if a directory holds the results of a campaign.
     pub fn is_in(directory: &Path) -> bool {
         directory.join(FILE).is_file()
     }
 
-    /// Reads the results of a campaign from its directory, all of them or as many as there are.
+    /// Reads the results of a campaign from its directory, complete or not.
     ///
     /// # Errors
     /// [`JournalError`].
@@ -357,9 +357,9 @@ mod tests {
     }
 
     proptest! {
-        /// Wherever the end of a journal is lost, or a byte of it is another: what is whole before that stays, and is gone on with.
+        /// The end of a journal is lost, or one byte is changed: the complete lines before that remain and the journal continues.
         #[test]
-        fn what_is_whole_survives_whatever_happens_to_the_rest(cut: prop::sample::Index, flipped: bool) {
+        fn complete_lines_survive_damage_after_them(cut: prop::sample::Index, flipped: bool) {
             let directory = tempfile::tempdir().unwrap();
             let mut journal = open(directory.path()).unwrap();
             for case in [5, 0, 3] {
@@ -385,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn a_journal_that_was_killed_at_its_first_line_begins_anew() {
+    fn an_incomplete_first_line_is_written_again() {
         let directory = tempfile::tempdir().unwrap();
         let head = line(&Head::new("01".to_owned(), None, &table()));
         for bytes in [&b""[..], &head.as_bytes()[..head.len() / 2]] {
@@ -395,14 +395,14 @@ mod tests {
     }
 
     #[test]
-    fn only_its_own_is_gone_on_with_and_by_one_at_a_time() {
+    fn a_journal_is_continued_by_its_own_campaign_and_one_process() {
         let directory = tempfile::tempdir().unwrap();
         let journal = open(directory.path()).unwrap();
         assert!(matches!(open(directory.path()), Err(JournalError::Busy { .. })));
         drop(journal);
         for (identity, shard) in [("02", None), ("01", Some([0, 2]))] {
-            let other = Head::new(identity.to_owned(), shard, &table());
-            let refused = Journal::open(directory.path(), &other, 8, place);
+            let head = Head::new(identity.to_owned(), shard, &table());
+            let refused = Journal::open(directory.path(), &head, 8, place);
             assert!(matches!(refused, Err(JournalError::Other { .. })), "{identity}");
         }
         let mut margins = table();

@@ -1,6 +1,6 @@
-//! Margins: the last value of a key at which something still holds, by bisection.
+//! Margins: the last value of a key at which a condition holds, by bisection.
 //!
-//! What holds on one side of it and not on the other is taken to do so once: of several changes one is found. Must not know how a
+//! The condition is taken to change once over the range; of several changes one is found. Must not know how a
 //! case is run.
 
 use super::axis::{self, Varied};
@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use toml::Value;
 
-/// The most halvings, from whatever range to whatever tolerance.
+/// Upper bound on the halvings.
 const MAX_HALVINGS: u32 = 60;
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -26,14 +26,14 @@ pub(super) struct RawMargin {
     pub tolerance: f64,
 }
 
-/// What must hold of a case.
+/// A condition on a case.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum SuchThat {
-    /// Its criteria.
+    /// Every acceptance criterion holds.
     #[default]
     Accepted,
-    /// Every metric with a limit came within it, for good, whenever.
+    /// Every metric with a limit settled within it, at any time.
     Settled,
 }
 
@@ -53,25 +53,25 @@ impl SuchThat {
     }
 }
 
-/// A margin that is searched for.
+/// A margin to search.
 #[derive(Debug, Clone)]
 pub(super) struct Searched {
-    /// It, without points.
+    /// The margin, without points.
     pub margin: Margin,
     pub such_that: SuchThat,
-    /// The axis of its key, if that is one.
+    /// The axis of its key, if the key is an axis.
     pub axis: Option<usize>,
-    /// Where the campaign names it.
+    /// Its place in the campaign's file.
     pub place: Place,
     whole: bool,
 }
 
 impl Margin {
-    /// Returns the points as a table, head and rows: each by its values of what is varied, then where the margin lies, known to the
-    /// tolerance. Cases are named where these values do not tell the points apart.
+    /// Returns the points as a table, head and rows: for each the values of the axes, then the bracket of the margin to its
+    /// tolerance. The case number is added if the values do not distinguish the points.
     pub fn rows(&self, axes: &[Axis]) -> (Vec<String>, Vec<Vec<String>>) {
-        let told = |axis: &usize| self.points.iter().any(|point| point.parameter(*axis).is_some());
-        let keys: Vec<usize> = (0..axes.len()).filter(|axis| axes[*axis].values.len() != 1).filter(told).collect();
+        let known = |axis: &usize| self.points.iter().any(|point| point.parameter(*axis).is_some());
+        let keys: Vec<usize> = (0..axes.len()).filter(|axis| axes[*axis].values.len() != 1).filter(known).collect();
         let parameter = |parameter: &Parameter| match parameter {
             Parameter::Number(number) => digits(*number),
             other => other.to_string(),
@@ -92,25 +92,25 @@ impl Margin {
 }
 
 impl MarginPoint {
-    /// The value of an axis at this point; none of the key that is moved.
+    /// Returns the value of an axis at this point; `None` for the moved key.
     pub fn parameter(&self, axis: usize) -> Option<&Parameter> {
         self.parameters.get(axis)?.as_ref()
     }
 }
 
-/// Where a bisection ended.
+/// The result of a bisection.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Found {
-    /// The last value at which it held.
+    /// The last value at which the condition held.
     pub value: Option<f64>,
-    /// It held at the first and did not at the second.
+    /// The condition held at the first and not at the second.
     pub bracket: [Option<f64>; 2],
-    /// How often it was tried.
+    /// The number of runs.
     pub runs: u64,
 }
 
 impl Searched {
-    /// Checks a margin; none if it was refused.
+    /// Checks a margin; `None` if it is refused.
     pub fn resolve(
         raw: &RawMargin,
         index: usize,
@@ -137,7 +137,7 @@ impl Searched {
         Some(Self { margin, such_that: raw.such_that, axis, place: document.place(&format!("{at}.key")), whole })
     }
 
-    /// Halves the range until it is narrow enough; none if `holds` has no answer any more.
+    /// Halves the range down to the tolerance; `None` once `holds` returns `None`.
     pub fn search(&self, mut holds: impl FnMut(Value) -> Option<bool>) -> Option<Found> {
         let [from, to] = self.margin.range;
         let (mut good, mut bad) = if self.margin.find == Find::Largest { (from, to) } else { (to, from) };
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn what_holds_nowhere_or_everywhere_is_told() {
+    fn a_condition_that_never_changes_leaves_an_open_bracket() {
         let searched = searched(Find::Smallest, [1.0, 2.0], 0.1, false);
         let nowhere = searched.search(|_| Some(false)).unwrap();
         assert_eq!(nowhere, Found { value: None, bracket: [None, Some(2.0)], runs: 1 });

@@ -1,6 +1,6 @@
-//! Campaigns: one scenario run many times, each time a little different, and the table that comes of it.
+//! Campaigns: one scenario run many times, each time a little different, and the resulting table.
 //!
-//! A case is a pure function of the campaign's text and the case's number: the same for ever, on every machine, under every
+//! A case is a pure function of the campaign's text and the case's number: the same in every version, on every machine, under every
 //! clock. Must not print, nor know how a command line looks.
 
 mod apply;

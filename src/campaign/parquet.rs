@@ -1,6 +1,6 @@
 //! The rows of a campaign as Parquet.
 //!
-//! A column has the type of its values, and what a row does not have is null. Must not hold more than the rows of one group.
+//! A column has the type of its values; a missing value is null. Must not hold more than the rows of one group.
 
 use super::table::{Kind, Parameter, Row, Table, columns};
 use crate::record::{Cell, ColumnKind, RowGroups};
@@ -9,7 +9,7 @@ use std::io::{self, Write};
 /// Rows of one group.
 const GROUP: usize = 8192;
 
-/// Writes rows, the parameters of which are of these kinds.
+/// Writes rows; `parameters` holds the kinds of their parameters.
 pub(super) fn write<W: Write + Send>(
     out: W,
     table: &Table,
@@ -17,14 +17,14 @@ pub(super) fn write<W: Write + Send>(
     rows: impl Iterator<Item = io::Result<Row>>,
 ) -> io::Result<()> {
     use ColumnKind::{Flag, Number, Whole, Word};
-    let of_parameters = parameters.iter().map(|kind| match kind {
+    let parameter_kinds = parameters.iter().map(|kind| match kind {
         Kind::Flag => Flag,
         Kind::Whole => Whole,
         Kind::Number => Number,
         Kind::Word => Word,
     });
     let mut kinds = vec![Whole; 2];
-    kinds.extend(of_parameters.chain([Flag, Word, Word, Word, Number]));
+    kinds.extend(parameter_kinds.chain([Flag, Word, Word, Word, Number]));
     kinds.extend(table.metrics.iter().map(|_| Number).chain([Whole; 6]).chain([Word, Number]));
     let columns = columns(table).into_iter().zip(kinds).collect();
     let mut groups = RowGroups::begin(out, "case", columns, true, Vec::new(), GROUP)?;
@@ -34,7 +34,7 @@ pub(super) fn write<W: Write + Send>(
     groups.end()
 }
 
-/// The values of a row, in the order of [`columns`].
+/// Returns the values of a row, in the order of [`columns`].
 fn values(row: Row, parameters: &[Kind]) -> Vec<Option<Cell>> {
     let whole = |count: u64| Some(Cell::Bits(count));
     let number = |value: Option<f64>| value.map(|value| Cell::Bits(value.to_bits()));
@@ -61,14 +61,14 @@ mod tests {
     use parquet::file::reader::{FileReader, SerializedFileReader};
     use parquet::record::Field;
 
-    /// Every column by its name, with its type and with null where there is nothing.
+    /// Every column by its name, with its type, and null for a missing value.
     #[test]
     fn rows_are_read_back_as_they_were() {
         let table = table();
-        let mut other = table.rows[0].clone();
-        (other.accepted, other.parameters) = (None, vec![Parameter::Whole(2)]);
+        let mut second = table.rows[0].clone();
+        (second.accepted, second.parameters) = (None, vec![Parameter::Whole(2)]);
         let mut file = tempfile::tempfile().unwrap();
-        let rows = [table.rows[0].clone(), other].map(Ok);
+        let rows = [table.rows[0].clone(), second].map(Ok);
         write(&mut file, &table, &[Kind::Number], rows.into_iter()).unwrap();
         let read = SerializedFileReader::new(file).unwrap();
         let read: Vec<_> = read.get_row_iter(None).unwrap().map(Result::unwrap).collect();

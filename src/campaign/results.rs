@@ -1,4 +1,5 @@
-//! The tables of a campaign that is done: CSV, Parquet with the feature, and a summary. The same bytes, whoever did the work.
+//! The tables of a campaign that is done: CSV, Parquet with the feature, and a summary. The bytes do not depend on which process did
+//! the work.
 //!
 //! Must not hold the rows: they pass from the journal to the files.
 
@@ -20,22 +21,22 @@ pub(crate) const CAMPAIGN: &str = "campaign.toml";
 const CASES: &str = "cases.csv";
 #[cfg(feature = "parquet")]
 const CASES_PARQUET: &str = "cases.parquet";
-/// What they come to, and the margins.
+/// The counts and the margins.
 const SUMMARY: &str = "summary.json";
 /// Layout version of the summary.
 const SCHEMA: &str = "corotate/sweep/v1";
-/// What the rows come to.
+/// The counts of the rows.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct Counts {
     /// Rows.
     pub rows: u64,
     /// Cases whose criteria hold.
     pub accepted: u64,
-    /// Cases of which some criterion does not.
+    /// Cases with a criterion that does not hold.
     pub not_accepted: u64,
     /// Cases that could not be judged.
     pub not_judged: u64,
-    /// How many cases ended how; only what occurred.
+    /// The number of cases by how they ended; zero counts are left out.
     pub exits: BTreeMap<&'static str, u64>,
     /// The cases of each verdict (accepted, not accepted, not judged) that did not run to their last tick, by how they ended.
     #[serde(skip)]
@@ -73,7 +74,7 @@ struct Summary<'a> {
     table: &'a Table,
 }
 
-/// Writes the tables into the directory of a campaign whose journal is whole.
+/// Writes the tables of a campaign whose journal is complete.
 pub(super) fn write(
     directory: &Path,
     campaign: &Campaign,
@@ -94,7 +95,7 @@ pub(super) fn write(
                     kinds
                         .iter_mut()
                         .zip(&row.parameters)
-                        .for_each(|(kind, one)| *kind = Some(Kind::of(one).with(*kind)));
+                        .for_each(|(kind, parameter)| *kind = Some(Kind::from_parameter(parameter).with(*kind)));
                     csv.write_record(record(&row))?;
                 }
                 Ok(Entry::Margin { margin, point }) => {
@@ -138,7 +139,7 @@ pub(super) fn write(
     Ok(counts)
 }
 
-/// Writes a file beside its place and puts it there when it is whole.
+/// Writes a file under another name and renames it when it is complete.
 pub(super) fn write_file(
     path: &Path,
     content: impl FnOnce(&mut BufWriter<files::Created>) -> io::Result<()>,
@@ -169,8 +170,7 @@ fn record(row: &Row) -> Vec<String> {
     record
 }
 
-/// The cases that fared worst and could be run, the worst first: lost or stopped, then not accepted, then those with the largest
-/// first metric.
+/// Returns the worst cases that ran, the worst first: lost or stopped, then not accepted, then by the largest first metric.
 pub fn worst(table: &Table, count: usize) -> Vec<u64> {
     let first = table.metrics.iter().position(|metric| metric.statistic == super::table::Statistic::SettledMax);
     let badness = |row: &&Row| {

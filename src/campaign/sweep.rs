@@ -1,7 +1,7 @@
-//! Runs a campaign on all cores, and goes on where it was interrupted.
+//! Runs a campaign on all cores, and continues an interrupted one.
 //!
-//! What is done is in the journal before it is counted. Memory follows from the cores and not from the cases, but for eight bytes per
-//! case. Must not do a piece of work twice, nor let the result depend on who did it.
+//! A result is in the journal before it is counted. Memory depends on the number of cores, plus eight bytes per case. Must not do
+//! a work item twice, nor let the result depend on the process that did it.
 
 use super::error::SweepError;
 use super::file::Campaign;
@@ -20,32 +20,32 @@ use std::sync::mpsc::sync_channel;
 /// Results that wait for the journal, per thread.
 const WAITING: usize = 2;
 
-/// How a campaign is run.
+/// The options of a sweep.
 pub struct Sweep<'a> {
-    /// How many cases run at a time.
+    /// The number of cases that run at a time.
     pub threads: usize,
-    /// The part of the campaign to run; none for all of it.
+    /// The part of the campaign to run; `None` for the whole.
     pub shard: Option<Shard>,
-    /// What drives the ticks: in one thread, or in lockstep.
+    /// The clock: in one thread, or lockstep.
     pub clock: ClockKind,
-    /// The signal that asked for the end; 0 while none has.
+    /// The signal that interrupts the sweep; 0 until one arrives.
     pub signal: &'a AtomicUsize,
-    /// Called for every piece of work that is done: how many are, and how many there are.
+    /// Called after every work item with the number of finished and of all items.
     pub progress: &'a mut dyn FnMut(u64, u64),
 }
 
-/// One of several equal parts of a campaign: every so-manyth piece of work.
+/// One of `count` equal parts of a campaign: every `count`-th work item.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
-    /// Which, from 0.
+    /// The index, from 0.
     pub index: u64,
-    /// Of how many.
+    /// The number of parts.
     pub count: u64,
 }
 
-/// A text is no shard.
+/// The text does not name a shard.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("a shard is I/N: I from 0, below N; as 0/4 to 3/4 for four")]
+#[error("expected I/N with I from 0 and below N, for example 0/4 to 3/4 for four shards")]
 pub struct NoShard;
 
 impl FromStr for Shard {
@@ -58,41 +58,41 @@ impl FromStr for Shard {
     }
 }
 
-/// What a sweep came to.
+/// The result of a sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Swept {
-    /// Pieces of work that are done: cases, and points of margins.
+    /// Finished work items: cases and points of margins.
     pub done: u64,
-    /// How many there are.
+    /// The number of all work items.
     pub all: u64,
-    /// What is in the tables; none where the sweep was interrupted and they are not written.
+    /// The counts in the tables; `None` if the sweep was interrupted and they are not written.
     pub counts: Option<Counts>,
 }
 
 impl Shard {
     const ALL: Self = Self { index: 0, count: 1 };
 
-    /// How many of all pieces are its.
+    /// Returns the number of its work items among all.
     fn pieces(self, all: u64) -> u64 {
         (all + self.count - 1 - self.index) / self.count
     }
 
-    /// The position of a piece among its own.
+    /// Returns the position of a work item among its own.
     fn place(self, piece: u64) -> Option<u64> {
         (piece % self.count == self.index).then_some(piece / self.count)
     }
 
-    fn told(self) -> Option<[u64; 2]> {
+    fn indices(self) -> Option<[u64; 2]> {
         (self != Self::ALL).then_some([self.index, self.count])
     }
 }
 
 impl Campaign {
-    /// Runs it, or what is left of it, and writes its tables once all is done. The directory is made, or has what an earlier run of
-    /// the same campaign left.
+    /// Runs the remaining work items, and writes the tables once all are done. The directory is new, or holds the results of an
+    /// earlier run of the same campaign.
     ///
     /// # Errors
-    /// [`SweepError`]. What had been done is in the journal.
+    /// [`SweepError`]. Finished work remains in the journal.
     pub fn sweep(&self, directory: &Path, sweep: &mut Sweep<'_>) -> Result<Swept, SweepError> {
         let shard = sweep.shard.unwrap_or(Shard::ALL);
         let mut journal = self.open(directory, shard)?;
@@ -100,17 +100,17 @@ impl Campaign {
         (sweep.progress)(journal.done(), all);
         self.work_on(&mut journal, shard, sweep)?;
         let done = journal.done();
-        let counts = if done == all { Some(results::write(directory, self, shard.told(), &journal)?) } else { None };
+        let counts = if done == all { Some(results::write(directory, self, shard.indices(), &journal)?) } else { None };
         Ok(Swept { done, all, counts })
     }
 
-    /// Whether a directory has results of this campaign, all of it.
+    /// Returns true if a directory holds results of this whole campaign.
     pub fn began(&self, directory: &Path) -> bool {
         let head = Head::new(self.identity(), None, &self.table());
         Reader::open(directory).is_ok_and(|reader| *reader.head() == head)
     }
 
-    /// The journal in a directory, which is made, or is one of this campaign's.
+    /// Opens the journal in a directory, a new one or one of this campaign.
     fn open(&self, directory: &Path, shard: Shard) -> Result<Journal, SweepError> {
         let refuse = |source| SweepError::Write { path: directory.to_owned(), source };
         files::create_directories(directory).map_err(refuse)?;
@@ -118,14 +118,14 @@ impl Campaign {
         if !empty && !directory.join(FILE).is_file() {
             return Err(SweepError::Foreign { path: directory.to_owned() });
         }
-        let head = Head::new(self.identity(), shard.told(), &self.table());
+        let head = Head::new(self.identity(), shard.indices(), &self.table());
         let place = |entry: &Entry| self.piece(entry).and_then(|piece| shard.place(piece));
         let journal = Journal::open(directory, &head, shard.pieces(self.pieces()), place)?;
         results::write_file(&directory.join(CAMPAIGN), |out| io::Write::write_all(out, self.to_toml().as_bytes()))?;
         Ok(journal)
     }
 
-    /// Does what is not done, until all is or a signal asks for the end.
+    /// Does the remaining work items, until all are done or a signal interrupts.
     fn work_on(&self, journal: &mut Journal, shard: Shard, sweep: &mut Sweep<'_>) -> Result<(), SweepError> {
         let places = shard.pieces(self.pieces());
         let left: Vec<u64> = (0..places).filter(|place| !journal.has(*place)).collect();
@@ -139,7 +139,7 @@ impl Campaign {
                     while signal.load(Ordering::Relaxed) == 0
                         && let Some(place) = left.get(next.fetch_add(1, Ordering::Relaxed) as usize)
                         && let Some(entry) = self.work(place * shard.count + shard.index, clock, signal)
-                        // Nobody waits for it where the journal could not be written.
+                        // The receiver is gone if the journal could not be written.
                         && sender.send((*place, entry)).is_ok()
                     {}
                 });
@@ -155,23 +155,23 @@ impl Campaign {
     }
 }
 
-/// Puts the results of all shards of a campaign together, as if it had been run in one place.
+/// Merges the results of all shards of a campaign, with the same result as one run of the whole.
 ///
 /// # Errors
-/// [`SweepError`], also where a case is missing or is in two directories and not the same.
+/// [`SweepError`], also if a case is missing, or differs between two directories.
 pub fn merge(directories: &[PathBuf], out: &Path) -> Result<Swept, SweepError> {
     let Some(first) = directories.first() else { return Ok(Swept { done: 0, all: 0, counts: None }) };
-    let head = Reader::open(first)?.head().of_all();
-    // It names no other file.
+    let head = Reader::open(first)?.head().whole();
+    // The campaign contains its scenario.
     let unknown = |name: &str| {
-        let text = format!("the campaign has its scenario in it, and names `{name}`");
+        let text = format!("the campaign contains its scenario, but names `{name}`");
         Err(ConfigError::Unknown { code: "unknown-scenario", text })
     };
     let mut whole = Campaign::load(&first.join(CAMPAIGN), &[], &unknown)?.collect(out)?;
     for directory in directories {
         let mut reader = Reader::open(directory)?;
-        if reader.head().of_all() != head || head.identity != whole.campaign.identity() {
-            return Err(SweepError::Mixed { first: first.clone(), other: directory.clone() });
+        if reader.head().whole() != head || head.identity != whole.campaign.identity() {
+            return Err(SweepError::Mixed { first: first.clone(), path: directory.clone() });
         }
         while let Some(entry) = reader.next()? {
             whole.take(&entry, directory)?;
@@ -180,7 +180,7 @@ pub fn merge(directories: &[PathBuf], out: &Path) -> Result<Swept, SweepError> {
     whole.finish()
 }
 
-/// The results of a campaign whose work is done by others, wherever, as they come in.
+/// Collects the results of a campaign whose work is done elsewhere, in order of arrival.
 pub struct Collection {
     campaign: Campaign,
     directory: PathBuf,
@@ -188,8 +188,8 @@ pub struct Collection {
 }
 
 impl Campaign {
-    /// Opens a directory for results, which is made, or has what an earlier run of the same campaign left. Nobody else can write to
-    /// it as long as it is open.
+    /// Opens a directory for results: a new one, or one with results of the same campaign. No other process can write to it
+    /// meanwhile.
     ///
     /// # Errors
     /// [`SweepError`].
@@ -200,26 +200,26 @@ impl Campaign {
 }
 
 impl Collection {
-    /// The [pieces of work](Campaign::pieces) that are not done.
+    /// Returns the [work items](Campaign::pieces) that are not done.
     pub fn left(&self) -> Vec<u64> {
         (0..self.campaign.pieces()).filter(|piece| !self.journal.has(*piece)).collect()
     }
 
-    /// Writes down what [came of a piece](Campaign::work), unless it is there.
+    /// Adds the [result of a work item](Campaign::work), unless it is present.
     ///
     /// # Errors
-    /// [`SweepError::Disagree`] if it is there and not the same; [`SweepError::Journal`].
+    /// [`SweepError::Disagree`] if a different result is present; [`SweepError::Journal`].
     pub fn add(&mut self, entry: &Entry) -> Result<(), SweepError> {
         self.take(entry, Path::new("what came"))
     }
 
-    /// The same of an entry that comes `from` a directory.
+    /// Like [`add`](Self::add), for an entry of the directory `from`.
     fn take(&mut self, entry: &Entry, from: &Path) -> Result<(), SweepError> {
         let Some(piece) = self.campaign.piece(entry) else { return Ok(()) };
         if !self.journal.has(piece) {
             return Ok(self.journal.add(piece, entry)?);
         }
-        if self.journal.lines()?.of(piece)?.is_some_and(|known| known == *entry) {
+        if self.journal.lines()?.entry(piece)?.is_some_and(|known| known == *entry) {
             return Ok(());
         }
         let (Entry::Row(Row { case, .. }) | Entry::Margin { point: MarginPoint { case, .. }, .. }) = *entry;
@@ -229,7 +229,7 @@ impl Collection {
     /// Writes the tables.
     ///
     /// # Errors
-    /// [`SweepError`], also where a piece is missing.
+    /// [`SweepError`], also if a work item is missing.
     pub fn finish(&self) -> Result<Swept, SweepError> {
         let (done, all) = (self.journal.done(), self.campaign.pieces());
         if let Some(first) = (0..all).find(|piece| !self.journal.has(*piece)) {

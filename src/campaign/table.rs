@@ -1,93 +1,93 @@
-//! The results of a campaign: one row per case, and the margins that were asked for.
+//! The results of a campaign: one row per case, and the margins.
 //!
 //! Plain data, the same in memory, as JSON and in the journal. Must not compute anything.
 
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// What came of a campaign, or of as much of it as has been run.
+/// The results of a campaign, complete or partial.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Table {
     /// The campaign's name.
     pub name: String,
     /// The scenario that is varied: the name of a shipped one, or a file, as the campaign names it.
     pub base: String,
-    /// What is varied; a row has one parameter for each.
+    /// The varied keys; a row has one parameter for each.
     pub axes: Vec<Axis>,
-    /// What is measured; a row has one value for each.
+    /// The measured statistics; a row has one value for each.
     pub metrics: Vec<Metric>,
-    /// How many cases the whole campaign has; where there are fewer rows, the others have not been run here.
+    /// The number of cases of the whole campaign; cases without a row have not been run here.
     pub cases: u64,
-    /// One per case that has been run, by its number.
+    /// One row per case that has been run, by case number.
     pub rows: Vec<Row>,
-    /// One per margin that is searched for.
+    /// One per margin.
     pub margins: Vec<Margin>,
 }
 
-/// One key of the scenario that is varied.
+/// A varied key of the scenario.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Axis {
     /// The key, as `--set` takes it: `controller.gain_per_s`, `fault.0.probability`. Its unit is its last part.
     pub key: String,
-    /// What to call it, where the campaign says so.
+    /// The label given in the campaign.
     pub label: Option<String>,
-    /// How its values are spread.
+    /// The distribution of its values.
     pub kind: AxisKind,
-    /// Every value that it takes, in order, where these are known beforehand; empty where they are drawn.
+    /// All values in order; empty if they are drawn.
     pub values: Vec<Parameter>,
 }
 
 impl Axis {
-    /// What to call it: its label, or its key.
+    /// Returns the label, or else the key.
     pub fn name(&self) -> &str {
         self.label.as_deref().unwrap_or(&self.key)
     }
 }
 
-/// How the values of an axis are spread.
+/// The distribution of an axis's values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum AxisKind {
     /// A list: words, flags, or numbers in the order of their author.
     Values,
-    /// Evenly.
+    /// Evenly spaced.
     Linear,
-    /// By equal factors: to be drawn on a logarithmic axis.
+    /// Spaced by equal factors, for a logarithmic axis.
     Log,
-    /// About a mean.
+    /// Normally distributed about a mean.
     Normal,
 }
 
-/// One number that is measured of every case: a statistic of one of the rig's metrics.
+/// One number per case: a statistic of one of the rig's metrics.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Metric {
     /// The column's name: metric and statistic, as `sync_error_rad_s.peak`.
     pub name: String,
     /// The rig's metric. Its unit is its last part.
     pub metric: String,
-    /// What is taken of it.
+    /// The statistic of the metric.
     pub statistic: Statistic,
 }
 
-/// What is taken of a metric over a run.
+/// A statistic of a metric over a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Statistic {
-    /// Its value at the last tick.
+    /// The value at the last tick.
     Last,
-    /// The largest from `accept.settled_by_s` on.
+    /// The largest value from `accept.settled_by_s` on.
     SettledMax,
-    /// The largest from `accept.peak_from_s` on.
+    /// The largest value from `accept.peak_from_s` on.
     Peak,
     /// The integral of its square over the run: unit² s.
     Ise,
 }
 
 impl Statistic {
-    /// All of them, in the order of the columns.
+    /// All statistics in the order of the columns.
     pub const ALL: [Self; 4] = [Self::Last, Self::SettledMax, Self::Peak, Self::Ise];
 
-    /// The second part of a column's name.
+    /// Returns the second part of a column's name.
     pub fn name(self) -> &'static str {
         match self {
             Self::Last => "last",
@@ -113,7 +113,7 @@ pub enum Parameter {
 }
 
 impl Parameter {
-    /// The value as a number, if it is one.
+    /// Returns the value as a number, if it has one.
     pub fn number(&self) -> Option<f64> {
         match self {
             Self::Whole(number) => Some(*number as f64),
@@ -137,24 +137,23 @@ impl fmt::Display for Parameter {
 /// One case.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Row {
-    /// Its number, from 0.
+    /// The number, from 0.
     pub case: u64,
-    /// The seed of its randomness.
+    /// The seed.
     pub seed: u64,
     /// The values of the axes, in their order.
     pub parameters: Vec<Parameter>,
-    /// Whether every criterion that could be judged holds; none if none could be, or if it did not run to its end.
+    /// True if every criterion that could be judged holds; `None` if no criterion could be judged, or if the run did not finish.
     pub accepted: Option<bool>,
-    /// The same in words, as a run's summary has it.
+    /// The verdict in words, as in a run's summary.
     pub verdict: String,
-    /// How it ended.
+    /// The end of the run.
     pub exit: End,
-    /// Why, where it did not run to its end.
+    /// The reason if the run did not finish.
     pub reason: Option<String>,
-    /// From this time on every metric that has a limit in `[accept]` stayed within it, s; none if there is none, or one did not.
+    /// The time from which every metric with a limit in `[accept]` stayed within it, s; `None` if one did not, or without limits.
     pub settled_at_s: Option<f64>,
-    /// The statistics, in the order of the table's metrics; none where there is none, or where it is not finite: of a body that
-    /// was lost.
+    /// The statistics in the order of the table's metrics; `None` if missing or not finite, as for a lost body.
     pub metrics: Vec<Option<f64>>,
     /// Ticks executed, all roles together.
     pub executed: u64,
@@ -168,20 +167,20 @@ pub struct Row {
     pub lost: u64,
     /// Samples that scripted faults touched, and stalls.
     pub injected: u64,
-    /// The state hash, as 16 hexadecimal digits; empty where nothing ran.
+    /// The state hash as 16 hexadecimal digits; empty if nothing ran.
     pub hash: String,
-    /// The slowest rate that is claimed of the loop's driven bodies, 1/s; none if the campaign does not ask for it, or none is
-    /// claimed.
+    /// The slowest proven rate of the loop's driven bodies, 1/s; `None` if the campaign does not ask for it, or if no rate is
+    /// proven.
     pub predicted_rate_per_s: Option<f64>,
 }
 
-/// How a case ended.
+/// The end of a case.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum End {
     /// It ran to its last tick.
     Completed,
-    /// It did, and a body came to where its model ends.
+    /// It ran to its last tick, and a body left the range of its model.
     Lost,
     /// A role failed, and the run was ended.
     Stopped,
@@ -193,7 +192,7 @@ pub enum End {
 }
 
 impl End {
-    /// Its name, as in tables.
+    /// Returns the name used in tables.
     pub fn name(self) -> &'static str {
         match self {
             Self::Completed => "completed",
@@ -205,46 +204,46 @@ impl End {
     }
 }
 
-/// A margin: how far a key can go at every point of the other axes.
+/// A margin: the range of a key at every point of the other axes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Margin {
     /// The key that is moved.
     pub key: String,
-    /// Which end is looked for.
+    /// The end to find.
     pub find: Find,
-    /// What must hold: `accepted`.
+    /// The condition, for example `accepted`.
     pub such_that: String,
-    /// Where the search begins and ends.
+    /// Both ends of the search.
     pub range: [f64; 2],
-    /// The bracket is at most so wide, in the key's unit.
+    /// The largest width of the bracket, in the key's unit.
     pub tolerance: f64,
-    /// One per point that has been searched, by its case.
+    /// One per searched point, by case number.
     pub points: Vec<MarginPoint>,
 }
 
-/// Which end of a range is looked for.
+/// The end of a range to find.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Find {
-    /// The largest value at which it holds.
+    /// The largest value at which the condition holds.
     Largest,
-    /// The smallest.
+    /// The smallest value at which the condition holds.
     Smallest,
 }
 
 /// A margin at one point of the other axes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MarginPoint {
-    /// The case whose parameters and seed it has, but for the key that is moved.
+    /// The case with the same parameters and seed, except the moved key.
     pub case: u64,
-    /// The values of the axes there, in their order; none for the key that is moved, if that is one.
+    /// The values of the axes in their order; `None` for the moved key, if it is an axis.
     pub parameters: Vec<Option<Parameter>>,
-    /// The last value at which it was seen to hold; none if it does not even where the search begins.
+    /// The last value at which the condition held; `None` if it does not hold where the search begins.
     pub value: Option<f64>,
-    /// The margin lies between these: it was seen to hold at the first, and not to hold at the second. None for an end at which
-    /// nothing was seen: the margin is beyond the range.
+    /// The bracket of the margin: the condition held at the first value and not at the second. `None` for an end beyond the
+    /// range.
     pub bracket: [Option<f64>; 2],
-    /// How many runs were needed.
+    /// The number of runs.
     pub runs: u64,
 }
 
@@ -253,7 +252,7 @@ pub(super) mod tests {
     use super::super::journal;
     use super::*;
 
-    /// A table with something of everything.
+    /// A table with an example of every part.
     pub fn table() -> Table {
         let metric = |statistic: Statistic| Metric {
             name: format!("sync_error_rad_s.{}", statistic.name()),
@@ -315,14 +314,14 @@ pub(super) mod tests {
         let head = journal::Head::new("0123".to_owned(), None, &table);
         let mut text = journal::line(&head);
         // Out of order, and one of them twice.
-        let other = Row { case: 1, ..table.rows[0].clone() };
-        for row in [&table.rows[0], &other, &other] {
+        let repeated = Row { case: 1, ..table.rows[0].clone() };
+        for row in [&table.rows[0], &repeated, &repeated] {
             text += &journal::line(&journal::Entry::Row(row.clone()));
         }
         text += &journal::line(&journal::Entry::Margin { margin: 0, point: table.margins[0].points[0].clone() });
         std::fs::write(directory.path().join(journal::FILE), format!("{text}0123456789abcdef {{\"row\"")).unwrap();
         let read = Table::read(directory.path()).unwrap();
-        assert_eq!(read, Table { rows: vec![other, table.rows[0].clone()], ..table });
+        assert_eq!(read, Table { rows: vec![repeated, table.rows[0].clone()], ..table });
     }
 }
 
@@ -333,7 +332,7 @@ const VERDICT: [&str; 5] = ["accepted", "verdict", "exit", "reason", "settled_at
 
 const LAST: [&str; 8] = ["executed", "missed", "starved", "safe", "lost", "injected", "hash", "predicted_rate_per_s"];
 
-/// The names of all columns, in the order of both tables.
+/// Returns the names of all columns, in the order of both tables.
 pub(super) fn columns(table: &Table) -> Vec<String> {
     let owned = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
     let axes = table.axes.iter().map(|axis| axis.key.clone()).collect();
@@ -341,7 +340,7 @@ pub(super) fn columns(table: &Table) -> Vec<String> {
     [owned(&FIRST), axes, owned(&VERDICT), metrics, owned(&LAST)].concat()
 }
 
-/// What the values of an axis have in common.
+/// The common type of an axis's values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     Flag,
@@ -351,7 +350,7 @@ pub(super) enum Kind {
 }
 
 impl Kind {
-    pub fn of(parameter: &Parameter) -> Self {
+    pub fn from_parameter(parameter: &Parameter) -> Self {
         match parameter {
             Parameter::Flag(_) => Self::Flag,
             Parameter::Whole(_) => Self::Whole,
@@ -360,10 +359,10 @@ impl Kind {
         }
     }
 
-    pub fn with(self, other: Option<Self>) -> Self {
-        match (self, other) {
-            (kind, None) => kind,
-            (kind, Some(other)) if kind == other => kind,
+    pub fn with(self, kind: Option<Self>) -> Self {
+        match (self, kind) {
+            (own, None) => own,
+            (own, Some(kind)) if own == kind => own,
             (Self::Whole | Self::Number, Some(Self::Whole | Self::Number)) => Self::Number,
             _ => Self::Word,
         }
