@@ -174,10 +174,7 @@ fn errors_name_the_place_and_the_remedy() {
         (refused("repeats = 1000000001"), "repeats: 1000000001 "),
         (refused("name = \"A b\"\nbase = \"rigid-pair\""), "name: `A b`"),
         (refused("name = \"a\"\nbase = \"rigid\""), "map.toml:2: base: there is no `rigid`; take another"),
-        (
-            refused("[[axis]]\nkey = \"a.b\"\nvalues = [1]\n[[axis]]\nkey = \"a\"\nvalues = [1]"),
-            "axis[1].key: `a.b`",
-        ),
+        (refused("[[axis]]\nkey = \"a.b\"\nvalues = [1]\n[[axis]]\nkey = \"a\"\nvalues = [1]"), "axis[1].key: `a.b`"),
         // An error of every case refuses the campaign.
         (
             refused("[[axis]]\nkey = \"controller.gain\"\nvalues = [1.0, 2.0]"),
