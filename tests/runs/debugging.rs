@@ -20,6 +20,12 @@ const LOCKSTEP: [&str; 9] = [
     "supervision.heartbeat_timeout_s=0.5",
     "--json",
 ];
+/// The same, until it is stopped: attaching a debugger may take longer than a short run.
+const ENDLESS: [&str; 9] = {
+    let mut line = LOCKSTEP;
+    line[5] = "100000";
+    line
+};
 /// Duration of a stop: longer than the heartbeat timeout.
 const STOPPED: Duration = Duration::from_millis(1500);
 
@@ -71,7 +77,7 @@ fn in_real_time_a_stopped_role_is_replaced_and_the_stop_is_named() {
 #[test]
 fn ctrl_c_ends_a_run_with_a_stopped_role_in_order() {
     let bench = Bench::new();
-    let run = bench.start(&LOCKSTEP);
+    let run = bench.start(&ENDLESS);
     let pid = bench.await_ticks("controller");
     send_signal(pid, STOP);
     std::thread::sleep(STOPPED);
@@ -125,7 +131,7 @@ fn with_debug_a_role_waits_for_a_debugger_before_the_first_tick() {
 #[test]
 fn lockstep_waits_for_a_debugged_role_and_ctrl_c_ends_the_run() {
     let bench = Bench::new();
-    let run = bench.start(&LOCKSTEP);
+    let run = bench.start(&ENDLESS);
     let pid = bench.await_ticks("controller");
     let gdb = Gdb::attach(&bench, pid, &[]);
     await_some(|| in_debugger(pid).then_some(()));
