@@ -1,11 +1,11 @@
-//! Messages between the hosts of a run; the only file that knows zenoh.
+//! Sends and receives messages between the hosts of a run; the only file that uses zenoh.
 //!
-//! The host that launches is a router, every other one its client: one port is open, and nothing is looked for by multicast or gossip.
-//! Nobody waits for a way: what finds none is lost, in a hurry at once, else after some bytes have piled up. Must not know what a message says, but for
-//! questions for the time, which are answered where they arrive.
+//! The launching host is a router, all others are its clients: one port is open, and there is no multicast or gossip. Sending never
+//! waits for the network: a message that cannot be sent is lost, an urgent one at once, any other when the queue is full. Must not
+//! interpret messages, except time requests, which are answered where they arrive.
 
-use super::seat::{Carrier, Endpoint, Keys};
-use super::wire::{Message, What};
+use super::endpoint::{Carrier, Endpoint, Keys};
+use super::wire::{Message, Payload};
 use crate::clock::{raw_ns, tai_offset_ns};
 use serde_json::json;
 use std::path::Path;
@@ -18,50 +18,50 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::Queryable;
 use zenoh::{Config, Session};
 
-/// Where the host that launches answers whoever wants to join, or asks for the time.
+/// Keys under which the launching host answers requests to join and for the time.
 const JOIN: &str = "corotate/join";
 const TIME: &str = "corotate/time";
-/// Time limit of one answer, and of one over UDP, where a lost datagram is only replaced by the next question.
+/// Timeout of an answer, and over UDP, where only the next request replaces a lost datagram.
 const ANSWER: Duration = Duration::from_secs(2);
 const ANSWER_UDP: Duration = Duration::from_millis(700);
-/// Questions in one session before a new session is opened.
-const QUESTIONS: usize = 3;
-/// Time limit of the handshake of a connection, ms. The engine does not repeat a lost datagram of it.
+/// Number of requests in one session before a new session is opened.
+const REQUESTS: usize = 3;
+/// Timeout of the handshake of a connection, ms. Zenoh does not repeat a lost datagram of it.
 const OPENING_MS: u64 = 1_500;
-/// Time limit of the first handshake over UDP, ms. It doubles at every second attempt, up to [`OPENING_MS`].
+/// Timeout of the first handshake over UDP, ms. It doubles at every second attempt, up to [`OPENING_MS`].
 const OPENING_UDP_MS: u64 = 400;
-/// After so long without a word the engine gives a connection up and looks for another, ms; over UDP, where nothing piles up on the
-/// way to a host that is gone, and a new connection is hard to get.
+/// Silence after which zenoh closes a connection and connects again, ms. Longer over UDP, where no data queues up for a lost host and
+/// connecting is difficult.
 const LEASE_MS: u64 = 2_000;
 const LEASE_UDP_MS: u64 = 10_000;
-/// Batches, of 64 KiB at the most, that may pile up of what is in no hurry: the most that the engine allows.
-const PILE: usize = 16;
-/// Between two tries to connect again, ms.
+/// Queue length of messages that are not urgent, in batches of at most 64 KiB: the largest that zenoh allows.
+const QUEUE_BATCHES: usize = 16;
+/// Pause between two attempts to connect, ms.
 const RETRY_MS: u64 = 200;
 const RETRY: Duration = Duration::from_millis(RETRY_MS);
 
-/// Returns how long the host that launches is looked for: longer where a handshake may be lost several times.
-pub fn patience(endpoint: &Endpoint) -> Duration {
+/// Returns the timeout of connecting to the launching host: longer where a handshake may be lost several times.
+pub fn connect_timeout(endpoint: &Endpoint) -> Duration {
     Duration::from_secs(if endpoint.address.carrier == Carrier::Udp { 20 } else { 10 })
 }
 
-/// Why hosts cannot talk.
+/// Failures of the connection between hosts.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum NetError {
-    /// Nobody can be reached, or nobody be listened for.
-    #[error("{address}: {reason}; {remedy}")]
+    /// The address cannot be opened, to listen or to connect.
+    #[error("cannot open {address}: {reason}; {remedy}")]
     #[strum(serialize = "cannot-connect")]
     Open {
         /// The address.
         address: String,
-        /// The engine's reason.
+        /// Zenoh's reason.
         reason: String,
-        /// What to do.
+        /// The remedy.
         remedy: &'static str,
     },
     /// A key file cannot be read.
-    #[error("cannot read {}: {reason}; docs/hosts.md tells how to make keys", path.display())]
+    #[error("cannot read {}: {reason}; docs/hosts.md shows how to make keys", path.display())]
     #[strum(serialize = "unreadable-key")]
     Key {
         /// The file.
@@ -69,41 +69,41 @@ pub enum NetError {
         /// The system's reason.
         reason: String,
     },
-    /// There is somebody, but no answer.
-    #[error("{address} does not answer; is `corotate run --listen` waiting there?")]
+    /// The host does not answer.
+    #[error("no answer from {address}; check that `corotate run --listen` waits there")]
     #[strum(serialize = "host-silent")]
     Silent {
         /// The address.
         address: String,
     },
-    /// The engine failed.
-    #[error("a message cannot be sent: {0}; is the network down?")]
+    /// Zenoh failed.
+    #[error("cannot send a message: {0}; check the network")]
     #[strum(serialize = "network-failed")]
     Engine(String),
 }
 
-/// Which way a session goes.
+/// The direction of a session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Side {
-    /// It waits for others: the host that launches.
-    Listens,
-    /// It goes to that one.
-    Connects,
+    /// Waits for connections: the launching host.
+    Listen,
+    /// Connects to the launching host.
+    Connect,
 }
 
-fn config(endpoint: &Endpoint, side: Side, patience: Duration, opening_ms: u64) -> Result<Config, NetError> {
+fn config(endpoint: &Endpoint, side: Side, timeout: Duration, opening_ms: u64) -> Result<Config, NetError> {
     let mut config = Config::default();
     let mut set = |key: &str, value: serde_json::Value| {
-        config.insert_json5(key, &value.to_string()).expect("these are keys of the engine's configuration");
+        config.insert_json5(key, &value.to_string()).expect("the keys and values are valid in zenoh's configuration");
     };
     let (listen, connect) = match side {
-        Side::Listens => (vec![endpoint.address.to_string()], Vec::new()),
-        Side::Connects => (Vec::new(), vec![endpoint.address.to_string()]),
+        Side::Listen => (vec![endpoint.address.to_string()], Vec::new()),
+        Side::Connect => (Vec::new(), vec![endpoint.address.to_string()]),
     };
-    set("mode", json!(if side == Side::Listens { "router" } else { "client" }));
+    set("mode", json!(if side == Side::Listen { "router" } else { "client" }));
     set("listen/endpoints", json!(listen));
     set("connect/endpoints", json!(connect));
-    set("connect/timeout_ms", json!(patience.as_millis() as u64));
+    set("connect/timeout_ms", json!(timeout.as_millis() as u64));
     set("connect/retry", json!({ "period_init_ms": RETRY_MS, "period_max_ms": RETRY_MS, "period_increase_factor": 1 }));
     set("scouting/multicast/enabled", json!(false));
     set("scouting/gossip/enabled", json!(false));
@@ -115,9 +115,9 @@ fn config(endpoint: &Endpoint, side: Side, patience: Duration, opening_ms: u64) 
         "transport/link/tx/lease",
         json!(if endpoint.address.carrier == Carrier::Udp { LEASE_UDP_MS } else { LEASE_MS }),
     );
-    set("transport/link/tx/queue/size/data", json!(PILE));
+    set("transport/link/tx/queue/size/data", json!(QUEUE_BATCHES));
     if let (Carrier::Quic, Some(Keys { ca, cert, key })) = (endpoint.address.carrier, &endpoint.keys) {
-        [ca, cert, key].into_iter().try_for_each(|path| readable(path))?;
+        [ca, cert, key].into_iter().try_for_each(|path| check_readable(path))?;
         set("transport/link/tls/root_ca_certificate", json!(ca));
         set("transport/link/tls/enable_mtls", json!(true));
         set("transport/link/tls/verify_name_on_connect", json!(true));
@@ -129,18 +129,18 @@ fn config(endpoint: &Endpoint, side: Side, patience: Duration, opening_ms: u64) 
     Ok(config)
 }
 
-fn readable(path: &Path) -> Result<(), NetError> {
+fn check_readable(path: &Path) -> Result<(), NetError> {
     let failed = |error: std::io::Error| NetError::Key { path: path.to_owned(), reason: error.to_string() };
     std::fs::File::open(path).map(drop).map_err(failed)
 }
 
-/// Opens a session. One that connects is tried again until `patience` is over.
-fn open(endpoint: &Endpoint, side: Side, patience: Duration) -> Result<Session, NetError> {
-    if (side, endpoint.address.carrier) != (Side::Connects, Carrier::Udp) {
-        return try_open(endpoint, side, patience, OPENING_MS);
+/// Opens a session. Repeats attempts to connect until `timeout` is over.
+fn open(endpoint: &Endpoint, side: Side, timeout: Duration) -> Result<Session, NetError> {
+    if (side, endpoint.address.carrier) != (Side::Connect, Carrier::Udp) {
+        return try_open(endpoint, side, timeout, OPENING_MS);
     }
-    // Each attempt is a session of its own: the router refuses a second connection of one whose handshake was half lost.
-    let end = Instant::now() + patience;
+    // Each attempt is a new session: the router refuses a second connection of a session whose handshake was lost halfway.
+    let end = Instant::now() + timeout;
     for attempt in 0.. {
         let opening_ms = (OPENING_UDP_MS << (attempt / 2).min(8)).min(OPENING_MS);
         let opened = try_open(endpoint, side, Duration::from_millis(opening_ms), opening_ms);
@@ -149,67 +149,67 @@ fn open(endpoint: &Endpoint, side: Side, patience: Duration) -> Result<Session, 
         }
         std::thread::sleep(RETRY);
     }
-    unreachable!("the attempts end by the time")
+    unreachable!("the loop returns at the timeout")
 }
 
-fn try_open(endpoint: &Endpoint, side: Side, patience: Duration, opening_ms: u64) -> Result<Session, NetError> {
-    zenoh::open(config(endpoint, side, patience, opening_ms)?).wait().map_err(|error| NetError::Open {
+fn try_open(endpoint: &Endpoint, side: Side, timeout: Duration, opening_ms: u64) -> Result<Session, NetError> {
+    zenoh::open(config(endpoint, side, timeout, opening_ms)?).wait().map_err(|error| NetError::Open {
         address: endpoint.address.to_string(),
-        // Where in the engine it was found out is of no use to anybody here.
+        // Without zenoh's source location.
         reason: error.to_string().split(" at /").next().unwrap_or_default().to_owned(),
         remedy: match (side, endpoint.address.carrier) {
-            (Side::Listens, _) => "name an address of this machine that is free",
-            (Side::Connects, Carrier::Quic) => {
-                "is `corotate run --listen` waiting there, and has one authority signed the keys of both, with the host's name in its \
-                 certificate?"
+            (Side::Listen, _) => "choose a free address of this machine",
+            (Side::Connect, Carrier::Quic) => {
+                "check that `corotate run --listen` waits there, that one authority has signed the keys of both hosts, and that this address \
+                 is in the launching host's certificate"
             }
-            (Side::Connects, _) => "is `corotate run --listen` waiting there?",
+            (Side::Connect, _) => "check that `corotate run --listen` waits there",
         },
     })
 }
 
-fn engine(error: zenoh::Error) -> NetError {
+fn zenoh_failed(error: zenoh::Error) -> NetError {
     NetError::Engine(error.to_string())
 }
 
-/// A message that came, and when, on this host's monotonic clock, ns.
-pub struct Arrived {
-    /// When it came.
+/// A received message.
+pub struct Arrival {
+    /// When it arrived, on this host's monotonic clock, ns.
     pub at_ns: u64,
-    /// Its bytes.
+    /// The bytes.
     pub bytes: Vec<u8>,
 }
 
-/// The ways to all hosts of a run.
-pub struct Post {
+/// The sending end of the connections to all hosts of a run.
+pub struct Outbox {
     keys: Vec<KeyExpr<'static>>,
     session: RwLock<Option<Session>>,
 }
 
-impl Post {
-    /// Sends a message to the host of this number. One in a `hurry` is lost where there is no way for it at once.
+impl Outbox {
+    /// Sends a message to the host with number `to`. An `urgent` message is lost if it cannot be sent at once.
     ///
     /// # Errors
     /// [`NetError::Engine`].
-    pub fn send(&self, to: u8, hurry: bool, message: &Message<'_>) -> Result<(), NetError> {
+    pub fn send(&self, to: u8, urgent: bool, message: &Message<'_>) -> Result<(), NetError> {
         let session = self.session.read().unwrap_or_else(PoisonError::into_inner);
         let Some(session) = &*session else { return Ok(()) };
-        let priority = if hurry { Priority::RealTime } else { Priority::Data };
-        // Not by a publisher: what that declares, and is told in return, may be lost, and then nothing is sent. Even what must
-        // not be lost is not waited for: it is sent again.
+        let priority = if urgent { Priority::RealTime } else { Priority::Data };
+        // Not by a publisher: its declaration may be lost, and then it sends nothing. Sending never waits for room, because the
+        // lossless stream repeats its frames.
         let put =
             session.put(&self.keys[usize::from(to)], message.encode()).congestion_control(CongestionControl::Drop);
-        put.priority(priority).express(hurry).wait().map_err(engine)
+        put.priority(priority).express(urgent).wait().map_err(zenoh_failed)
     }
 }
 
-/// A host's part in the messages of a run; it ends when this is dropped.
-pub struct Net {
+/// A host's connection to the others of a run, until it is dropped.
+pub struct Network {
     endpoint: Endpoint,
     /// This host's number.
     own: u8,
-    arrived: Arc<dyn Fn(Arrived) + Send + Sync>,
-    post: Arc<Post>,
+    on_message: Arc<dyn Fn(Arrival) + Send + Sync>,
+    outbox: Arc<Outbox>,
     opened: Mutex<Option<Opened>>,
 }
 
@@ -219,12 +219,12 @@ struct Opened {
     _answers: Vec<Queryable<()>>,
 }
 
-/// What answers questions: the request's bytes in, the answer's out.
+/// A function that returns the answer to a request.
 pub type Answers = Box<dyn Fn(&[u8]) -> Vec<u8> + Send + Sync>;
 
-impl Net {
-    /// Opens the way to all `hosts` of a `run` for the one with number `own`. What comes goes to `arrived`; whoever wants to join is
-    /// answered by `joins`, if this is where one joins.
+impl Network {
+    /// Connects host number `own` of a run with `hosts` hosts. Calls `on_message` with each received message. On the launching host,
+    /// `joins` answers requests to join.
     ///
     /// # Errors
     /// [`NetError`].
@@ -232,54 +232,57 @@ impl Net {
         endpoint: &Endpoint,
         run: &str,
         (own, hosts): (u8, u8),
-        arrived: impl Fn(Arrived) + Send + Sync + 'static,
+        on_message: impl Fn(Arrival) + Send + Sync + 'static,
         joins: Option<Answers>,
     ) -> Result<Self, NetError> {
-        let key = |host: u8| KeyExpr::try_from(format!("corotate/{run}/{host}")).map_err(engine);
+        let key = |host: u8| KeyExpr::try_from(format!("corotate/{run}/{host}")).map_err(zenoh_failed);
         let keys = (0..hosts).map(key).collect::<Result<_, NetError>>()?;
         let net = Self {
             endpoint: endpoint.clone(),
             own,
-            arrived: Arc::new(arrived),
-            post: Arc::new(Post { keys, session: RwLock::default() }),
+            on_message: Arc::new(on_message),
+            outbox: Arc::new(Outbox { keys, session: RwLock::default() }),
             opened: Mutex::default(),
         };
-        net.begin(joins, patience(endpoint))?;
+        net.begin(joins, connect_timeout(endpoint))?;
         Ok(net)
     }
 
-    /// Replaces the session that goes to the host that launches. The engine connects again by itself, but what it declares then may
-    /// be lost: such a session looks open and carries nothing.
+    /// Replaces the session with the launching host. Zenoh connects again by itself, but what it declares then may be lost: such a
+    /// session looks open and carries nothing.
     ///
     /// # Errors
     /// [`NetError`]; the old session is kept.
-    pub fn reopen(&self, patience: Duration) -> Result<(), NetError> {
-        self.begin(None, patience)
+    pub fn reopen(&self, timeout: Duration) -> Result<(), NetError> {
+        self.begin(None, timeout)
     }
 
-    fn begin(&self, joins: Option<Answers>, patience: Duration) -> Result<(), NetError> {
-        let side = if joins.is_some() { Side::Listens } else { Side::Connects };
-        let session = open(&self.endpoint, side, patience)?;
+    fn begin(&self, joins: Option<Answers>, timeout: Duration) -> Result<(), NetError> {
+        let side = if joins.is_some() { Side::Listen } else { Side::Connect };
+        let session = open(&self.endpoint, side, timeout)?;
         let own = self.own;
-        let old = self.post.session.write().unwrap_or_else(PoisonError::into_inner).replace(session.clone());
-        let (hosts, answers_to, arrived) = (self.post.keys.len(), self.post.clone(), self.arrived.clone());
-        let heard = move |sample: zenoh::sample::Sample| {
+        let old = self.outbox.session.write().unwrap_or_else(PoisonError::into_inner).replace(session.clone());
+        let (hosts, outbox, on_message) = (self.outbox.keys.len(), self.outbox.clone(), self.on_message.clone());
+        let on_sample = move |sample: zenoh::sample::Sample| {
             let (at_ns, bytes) = (raw_ns(), sample.payload().to_bytes().into_owned());
-            if let Some(Message { from, what: What::Ping { sent_ns } }) = Message::decode(&bytes)
+            if let Some(Message { from, payload: Payload::Ping { sent_ns } }) = Message::decode(&bytes)
                 && usize::from(from) < hosts
             {
-                // A question that is not answered is asked again.
-                let _ = answers_to.send(from, true, &Message { from: own, what: pong(sent_ns, at_ns) });
+                // A request without an answer is repeated.
+                let _ = outbox.send(from, true, &Message { from: own, payload: pong(sent_ns, at_ns) });
             }
-            arrived(Arrived { at_ns, bytes });
+            on_message(Arrival { at_ns, bytes });
         };
-        let subscriber =
-            session.declare_subscriber(&self.post.keys[usize::from(own)]).callback(heard).wait().map_err(engine)?;
+        let subscriber = session
+            .declare_subscriber(&self.outbox.keys[usize::from(own)])
+            .callback(on_sample)
+            .wait()
+            .map_err(zenoh_failed)?;
         let answers = joins.map_or(Ok(Vec::new()), |joins| {
             let time: Answers = Box::new(move |request| {
                 let at_ns = raw_ns();
                 let sent_ns = request.first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
-                Message { from: own, what: pong(sent_ns, at_ns) }.encode()
+                Message { from: own, payload: pong(sent_ns, at_ns) }.encode()
             });
             [(JOIN, joins), (TIME, time)].map(|(key, answers)| answer(&session, key, answers)).into_iter().collect()
         })?;
@@ -288,15 +291,15 @@ impl Net {
         Ok(())
     }
 
-    /// The ways to all hosts, for any thread.
-    pub fn post(&self) -> Arc<Post> {
-        self.post.clone()
+    /// Returns the sending end, which any thread may use.
+    pub fn outbox(&self) -> Arc<Outbox> {
+        self.outbox.clone()
     }
 }
 
-fn pong(sent_ns: u64, received_ns: u64) -> What<'static> {
+fn pong(sent_ns: u64, received_ns: u64) -> Payload<'static> {
     let tai_offset_ns = tai_offset_ns() as u64;
-    What::Pong { sent_ns, received_ns, answered_ns: raw_ns(), tai_offset_ns }
+    Payload::Pong { sent_ns, received_ns, answered_ns: raw_ns(), tai_offset_ns }
 }
 
 fn answer(session: &Session, key: &'static str, answers: Answers) -> Result<Queryable<()>, NetError> {
@@ -304,21 +307,21 @@ fn answer(session: &Session, key: &'static str, answers: Answers) -> Result<Quer
         let request = query.payload().map_or(Vec::new(), |payload| payload.to_bytes().into_owned());
         let _ = query.reply(key, answers(&request)).wait();
     };
-    session.declare_queryable(key).callback(callback).wait().map_err(engine)
+    session.declare_queryable(key).callback(callback).wait().map_err(zenoh_failed)
 }
 
-/// Asks the host that launches to join its run, until it answers or the time is over. One that listens may not answer yet, and
-/// a way that loses may lose the question, the answer, or the handshake.
+/// Asks the launching host to join its run, until it answers or the timeout is over. A host that listens may not answer yet, and the
+/// network may lose request, answer or handshake.
 ///
 /// # Errors
 /// [`NetError`].
 pub fn ask_to_join(endpoint: &Endpoint, request: &[u8]) -> Result<Vec<u8>, NetError> {
-    let end = Instant::now() + patience(endpoint);
+    let end = Instant::now() + connect_timeout(endpoint);
     loop {
-        let inquiry = Inquiry::open(endpoint, end.saturating_duration_since(Instant::now()))?;
-        for _ in 0..QUESTIONS {
+        let session = HubSession::open(endpoint, end.saturating_duration_since(Instant::now()))?;
+        for _ in 0..REQUESTS {
             let asked = Instant::now();
-            let answer = inquiry.ask(JOIN, request);
+            let answer = session.ask(JOIN, request);
             if !matches!(answer, Err(NetError::Silent { .. })) || Instant::now() >= end {
                 return answer;
             }
@@ -327,35 +330,40 @@ pub fn ask_to_join(endpoint: &Endpoint, request: &[u8]) -> Result<Vec<u8>, NetEr
     }
 }
 
-/// A way to ask the host that launches, before a run.
-pub struct Inquiry {
+/// A session with the launching host before a run.
+pub struct HubSession {
     session: Session,
     address: String,
-    limit: Duration,
+    timeout: Duration,
 }
 
-impl Inquiry {
-    /// Goes to where a run listens.
+impl HubSession {
+    /// Connects to the launching host.
     ///
     /// # Errors
     /// [`NetError`].
-    pub fn open(endpoint: &Endpoint, patience: Duration) -> Result<Self, NetError> {
-        let limit = if endpoint.address.carrier == Carrier::Udp { ANSWER_UDP } else { ANSWER };
-        Ok(Self { session: open(endpoint, Side::Connects, patience)?, address: endpoint.address.to_string(), limit })
+    pub fn open(endpoint: &Endpoint, timeout: Duration) -> Result<Self, NetError> {
+        let answer_timeout = if endpoint.address.carrier == Carrier::Udp { ANSWER_UDP } else { ANSWER };
+        Ok(Self {
+            session: open(endpoint, Side::Connect, timeout)?,
+            address: endpoint.address.to_string(),
+            timeout: answer_timeout,
+        })
     }
 
-    /// Asks for the time; gives the answer, a message.
+    /// Requests the time. Returns the answer, an encoded [`Message`].
     ///
     /// # Errors
     /// [`NetError::Silent`], [`NetError::Engine`].
-    pub fn time(&self) -> Result<Vec<u8>, NetError> {
+    pub fn request_time(&self) -> Result<Vec<u8>, NetError> {
         self.ask(TIME, &raw_ns().to_le_bytes())
     }
 
     fn ask(&self, key: &str, request: &[u8]) -> Result<Vec<u8>, NetError> {
         let silent = || NetError::Silent { address: self.address.clone() };
-        let replies = self.session.get(key).payload(request.to_vec()).timeout(self.limit).wait().map_err(engine)?;
-        let reply = replies.recv_timeout(self.limit).ok().flatten().ok_or_else(silent)?;
+        let replies =
+            self.session.get(key).payload(request.to_vec()).timeout(self.timeout).wait().map_err(zenoh_failed)?;
+        let reply = replies.recv_timeout(self.timeout).ok().flatten().ok_or_else(silent)?;
         let sample = reply.result().map_err(|_| silent())?;
         Ok(sample.payload().to_bytes().into_owned())
     }

@@ -1,66 +1,66 @@
-//! How far two clocks are apart, from messages there and back with four time stamps: pure arithmetic, and bounds that hold whatever the
-//! network does.
+//! Estimates the offset between two clocks from messages and answers with four time stamps. Pure arithmetic; the error bounds hold for
+//! every network.
 //!
-//! Of one exchange the offset is known to half its round trip, and no better: the ways there and back may differ by all of it. So the
-//! fastest exchange of each window is kept, and a line through these is the offset with its drift. Must not read a clock.
+//! One exchange gives the offset to half its round trip and no better, because all of it may be spent in one direction. So the fastest
+//! exchange of each window is kept, and a line through these gives offset and drift. Must not read a clock.
 
 use std::collections::VecDeque;
 
-/// A window of which the fastest exchange is kept, ns.
+/// Length of a window, of which the fastest exchange is kept, ns.
 const WINDOW_NS: u64 = 500_000_000;
-/// Windows that are kept: long enough for the drift, short enough for a drift that changes with temperature.
+/// Number of windows: enough to measure the drift, few enough for a drift that changes with temperature.
 const WINDOWS: usize = 24;
-/// Over less than this a drift is not told from jitter, ns.
+/// Shortest span over which a drift is distinguished from jitter, ns.
 const DRIFT_SPAN_NS: f64 = 1e9;
-/// What two clocks of computers drift apart at the most, ns per ns: quartz is within 100 ppm.
+/// Largest drift between two computer clocks, ns per ns: each quartz is within 100 ppm.
 const DRIFT_MAX: f64 = 200e-6;
-/// Exchanges before anything is said.
+/// Number of exchanges before the first estimate.
 const ENOUGH: usize = 20;
-/// A part of the least round trip by which exchanges count as equally fast.
+/// Fraction of the shortest round trip within which exchanges count as equally fast.
 const SIMILAR: f64 = 0.15;
 
-/// The time stamps of a message and its answer, ns: sent here, received there, answered there, received here.
+/// The time stamps of a message to the remote host and its answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Exchange {
-    /// When the message was sent, on the clock here.
+    /// When the message was sent, on the local clock, ns.
     pub sent_ns: u64,
-    /// When it came, on the clock there.
+    /// When it arrived, on the remote clock, ns.
     pub received_ns: u64,
-    /// When the answer was sent, on the clock there.
+    /// When the answer was sent, on the remote clock, ns.
     pub answered_ns: u64,
-    /// When the answer came, on the clock here.
+    /// When the answer arrived, on the local clock, ns.
     pub returned_ns: u64,
 }
 
 impl Exchange {
-    /// The time on the way, ns; none of stamps that cannot be.
+    /// Returns the time spent on the network, ns; `None` if the stamps are impossible.
     pub fn round_trip_ns(&self) -> Option<u64> {
-        let [away, there] =
+        let [total, remote] =
             [self.returned_ns.checked_sub(self.sent_ns)?, self.answered_ns.checked_sub(self.received_ns)?];
-        away.checked_sub(there)
+        total.checked_sub(remote)
     }
 
-    /// The clock there less the clock here, ns, if both ways take as long.
+    /// Returns the remote clock less the local one, ns, if both directions take equally long.
     fn offset_ns(&self) -> i64 {
-        let [there, back] = [
+        let [forward, back] = [
             self.received_ns.wrapping_sub(self.sent_ns) as i64,
             self.answered_ns.wrapping_sub(self.returned_ns) as i64,
         ];
-        // Halved first: the sum of two offsets to the year 1970 has no room.
-        there / 2 + back / 2
+        // Halved first: the sum of two offsets as large as the time since 1970 would overflow.
+        forward / 2 + back / 2
     }
 }
 
-/// What is known of the other clock.
+/// The estimate of the remote clock at one time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
-    /// It less the clock here, ns.
+    /// The remote clock less the local one, ns.
     pub offset_ns: i64,
-    /// By how much that changes, ns per ns.
+    /// Change of the offset, ns per ns.
     pub drift: f64,
-    /// The offset is wrong by no more than this, ns.
+    /// Bound on the offset's error, ns.
     pub error_ns: f64,
-    /// The fastest exchange of late, ns.
+    /// The shortest recent round trip, ns.
     pub round_trip_ns: u64,
 }
 
@@ -68,31 +68,31 @@ pub struct Estimate {
 #[derive(Debug, Clone, Copy)]
 struct Fastest {
     window: u64,
-    /// In the middle of the exchange, on the clock here, since the first one, ns.
+    /// Middle of the exchange on the local clock, since the first exchange, ns.
     at_ns: f64,
-    /// Beyond the offset of the first one, ns.
+    /// Offset less that of the first exchange, ns.
     offset_ns: f64,
     round_trip_ns: f64,
 }
 
 impl Fastest {
-    /// What it leaves open of the offset in its middle, ns: half the way, and what clocks drift on it.
-    fn open_ns(&self) -> f64 {
+    /// Returns the bound on the error of the offset, ns: half the round trip, and the largest drift during it.
+    fn error_ns(&self) -> f64 {
         self.round_trip_ns * (0.5 + DRIFT_MAX)
     }
 }
 
-/// Estimates the offset of one clock.
+/// An estimator of the offset and drift of one remote clock.
 #[derive(Debug, Default)]
 pub struct OffsetEstimator {
-    /// The first exchange: what all others are told relative to.
+    /// Time and offset of the first exchange; those in `fastest` are relative to it.
     origin: Option<(u64, i64)>,
     fastest: VecDeque<Fastest>,
     taken: usize,
 }
 
 impl OffsetEstimator {
-    /// Takes an exchange; of one that cannot be, nothing.
+    /// Takes an exchange; ignores one with impossible stamps.
     pub fn take(&mut self, exchange: Exchange) {
         let Some(round_trip_ns) = exchange.round_trip_ns() else { return };
         let (origin_ns, origin_offset_ns) = *self.origin.get_or_insert((exchange.sent_ns, exchange.offset_ns()));
@@ -114,55 +114,56 @@ impl OffsetEstimator {
         }
     }
 
-    /// What is known at a time on the clock here; none before enough has been exchanged.
+    /// Returns the estimate at a time on the local clock; `None` before enough exchanges.
     pub fn at(&self, now_ns: u64) -> Option<Estimate> {
         let (origin_ns, origin_offset_ns) = self.origin.filter(|_| self.taken >= ENOUGH)?;
         let now = now_ns.wrapping_sub(origin_ns) as i64 as f64;
         let least_ns = self.fastest.iter().map(|point| point.round_trip_ns).fold(f64::INFINITY, f64::min);
         let (offset, drift) = self.line(least_ns);
         let drift_error = self.drift_error(drift);
-        // Any of them bounds the offset of its own time, and with the drift that of now.
+        // Each kept exchange bounds the offset at its own time, and with the drift the offset at `now_ns`.
         let bound = |point: &Fastest| {
-            let missed = (offset + drift * point.at_ns - point.offset_ns).abs();
-            point.open_ns() + missed + drift_error * (now - point.at_ns).abs()
+            let residual = (offset + drift * point.at_ns - point.offset_ns).abs();
+            point.error_ns() + residual + drift_error * (now - point.at_ns).abs()
         };
         let error_ns = self.fastest.iter().map(bound).fold(f64::INFINITY, f64::min);
         let offset_ns = origin_offset_ns.wrapping_add((offset + drift * now).round() as i64);
         Some(Estimate { offset_ns, drift, error_ns, round_trip_ns: least_ns as u64 })
     }
 
-    /// By how much a drift can be wrong: any two exchanges bound it.
+    /// Returns a bound on the error of a drift: any two exchanges give one.
     fn drift_error(&self, drift: f64) -> f64 {
         let pairs = self.fastest.iter().enumerate().flat_map(|(n, a)| self.fastest.range(..n).map(move |b| (a, b)));
         let bound = |(a, b): (&Fastest, &Fastest)| {
             let apart_ns = a.at_ns - b.at_ns;
-            (drift - (a.offset_ns - b.offset_ns) / apart_ns).abs() + (a.open_ns() + b.open_ns()) / apart_ns
+            (drift - (a.offset_ns - b.offset_ns) / apart_ns).abs() + (a.error_ns() + b.error_ns()) / apart_ns
         };
         pairs.filter(|(a, b)| a.at_ns > b.at_ns).map(bound).fold(drift.abs() + DRIFT_MAX, f64::min)
     }
 
-    /// The line of least squares, where a slow exchange weighs less by what it leaves open: offset at the origin, and drift.
+    /// Returns offset at the origin and drift of the least-squares line; slower exchanges have lower weight.
     fn line(&self, least_ns: f64) -> (f64, f64) {
         let weight = |point: &Fastest| {
-            let open = (point.round_trip_ns - least_ns) / (SIMILAR * least_ns + 1.0);
-            1.0 / (1.0 + open * open)
+            let excess = (point.round_trip_ns - least_ns) / (SIMILAR * least_ns + 1.0);
+            1.0 / (1.0 + excess * excess)
         };
-        let sum =
-            |of: &dyn Fn(&Fastest) -> f64| self.fastest.iter().map(|point| weight(point) * of(point)).sum::<f64>();
+        let sum = |value: &dyn Fn(&Fastest) -> f64| {
+            self.fastest.iter().map(|point| weight(point) * value(point)).sum::<f64>()
+        };
         let total = sum(&|_| 1.0);
         let (time, offset) = (sum(&|point| point.at_ns) / total, sum(&|point| point.offset_ns) / total);
-        let spread = sum(&|point| (point.at_ns - time).powi(2));
-        let together = sum(&|point| (point.at_ns - time) * (point.offset_ns - offset));
+        let variance = sum(&|point| (point.at_ns - time).powi(2));
+        let covariance = sum(&|point| (point.at_ns - time) * (point.offset_ns - offset));
         let span_ns = match (self.fastest.front(), self.fastest.back()) {
             (Some(first), Some(last)) => last.at_ns - first.at_ns,
             _ => 0.0,
         };
         if span_ns < DRIFT_SPAN_NS {
-            // The newest of the fast ones has drifted least.
-            let fast = |point: &&Fastest| point.round_trip_ns <= (1.0 + SIMILAR) * least_ns;
-            return (self.fastest.iter().rev().find(fast).map_or(offset, |point| point.offset_ns), 0.0);
+            // Among equally fast exchanges the newest has drifted least.
+            let is_fast = |point: &&Fastest| point.round_trip_ns <= (1.0 + SIMILAR) * least_ns;
+            return (self.fastest.iter().rev().find(is_fast).map_or(offset, |point| point.offset_ns), 0.0);
         }
-        let drift = (together / spread).clamp(-DRIFT_MAX, DRIFT_MAX);
+        let drift = (covariance / variance).clamp(-DRIFT_MAX, DRIFT_MAX);
         (offset - drift * time, drift)
     }
 }
@@ -174,7 +175,7 @@ mod tests {
     use rand_pcg::Pcg64;
     use rand_pcg::rand_core::Rng;
 
-    /// Two clocks, and a network with queues: mostly fast, now and then slow, one way or the other.
+    /// Two clocks, and a network with queues: mostly fast, at times slow, in either direction.
     struct World {
         offset_ns: i64,
         drift: f64,
@@ -188,31 +189,31 @@ mod tests {
             (self.random.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
         }
 
-        fn there(&self, here_ns: f64) -> u64 {
+        fn remote(&self, here_ns: f64) -> u64 {
             (here_ns + self.drift * here_ns) as u64 + self.offset_ns as u64
         }
 
-        fn way(&mut self) -> f64 {
+        fn one_way(&mut self) -> f64 {
             let queue = -self.uniform().max(1e-12).ln();
-            let held_up = if self.uniform() < 0.05 { 20.0 } else { 1.0 };
-            self.base_ns + self.jitter_ns * queue * held_up
+            let congestion = if self.uniform() < 0.05 { 20.0 } else { 1.0 };
+            self.base_ns + self.jitter_ns * queue * congestion
         }
 
         fn exchange(&mut self, at_ns: f64) -> Exchange {
-            let (away, held, back) = (self.way(), 5_000.0, self.way());
+            let (away, answering, back) = (self.one_way(), 5_000.0, self.one_way());
             Exchange {
                 sent_ns: at_ns as u64,
-                received_ns: self.there(at_ns + away),
-                answered_ns: self.there(at_ns + away + held),
-                returned_ns: (at_ns + away + held + back) as u64,
+                received_ns: self.remote(at_ns + away),
+                answered_ns: self.remote(at_ns + away + answering),
+                returned_ns: (at_ns + away + answering + back) as u64,
             }
         }
     }
 
-    /// The largest errors after the first second: of the offset, and of the bound that was told, which must cover it.
+    /// Returns the largest error of the offset and the largest bound after the first second. Panics if the bound does not hold.
     fn follow(mut world: World, seconds: u64) -> (f64, f64) {
         let mut estimator = OffsetEstimator::default();
-        let (mut worst, mut told) = (0.0_f64, 0.0_f64);
+        let (mut worst, mut bound) = (0.0_f64, 0.0_f64);
         for step in 0..seconds * 20 {
             let at_ns = 5e12 + step as f64 * 5e7;
             estimator.take(world.exchange(at_ns));
@@ -221,16 +222,16 @@ mod tests {
             }
             let now_ns = at_ns as u64 + 10_000_000;
             let estimate = estimator.at(now_ns).unwrap();
-            let truth = world.there(now_ns as f64).wrapping_sub(now_ns) as i64;
+            let truth = world.remote(now_ns as f64).wrapping_sub(now_ns) as i64;
             let error = (estimate.offset_ns - truth).abs() as f64;
-            assert!(error <= estimate.error_ns + 2.0, "wrong by {error} ns, told {} ns", estimate.error_ns);
-            (worst, told) = (worst.max(error), told.max(estimate.error_ns));
+            assert!(error <= estimate.error_ns + 2.0, "error {error} ns, bound {} ns", estimate.error_ns);
+            (worst, bound) = (worst.max(error), bound.max(estimate.error_ns));
         }
-        (worst, told)
+        (worst, bound)
     }
 
     #[test]
-    fn clocks_that_drift_by_50_ppm_are_followed() {
+    fn error_and_bound_stay_small_at_a_drift_of_50_ppm() {
         let world = World {
             offset_ns: 1_000_000_000_000,
             drift: 50e-6,
@@ -238,12 +239,12 @@ mod tests {
             jitter_ns: 20_000.0,
             random: Pcg64::new(1, 1),
         };
-        let (worst, told) = follow(world, 60);
-        assert!(worst < 60_000.0 && told < 300_000.0, "wrong by at most {worst} ns, told {told} ns");
+        let (worst, bound) = follow(world, 60);
+        assert!(worst < 60_000.0 && bound < 300_000.0, "error at most {worst} ns, bound {bound} ns");
     }
 
     #[test]
-    fn the_drift_is_found() {
+    fn the_drift_is_estimated_to_1_ppm() {
         let mut world =
             World { offset_ns: 7, drift: 50e-6, base_ns: 60_000.0, jitter_ns: 5_000.0, random: Pcg64::new(2, 1) };
         let mut estimator = OffsetEstimator::default();
@@ -253,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn stamps_that_cannot_be_are_left_out_and_few_say_nothing() {
+    fn impossible_stamps_are_ignored_and_few_exchanges_give_no_estimate() {
         let mut estimator = OffsetEstimator::default();
         let stamps = |sent_ns, received_ns, answered_ns, returned_ns| Exchange {
             sent_ns,
@@ -275,9 +276,8 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(64))]
 
-        /// Whatever the clocks and the network: what is told covers what is.
         #[test]
-        fn the_bound_holds(
+        fn the_bound_holds_for_all_clocks_and_networks(
             offset_ns in -4_000_000_000_000_i64..4_000_000_000_000_000,
             drift in -150e-6..150e-6_f64,
             base_ns in 1_000.0..5e6_f64,

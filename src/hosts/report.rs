@@ -1,123 +1,125 @@
-//! What a host tells of its part in a run when it ends: its clock, its links, its silences. Must not judge.
+//! Statistics of a host at the end of a run: its clock, its links, and silences of other hosts. Must not judge them.
 
 use crate::telemetry::Percentiles;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// A relay's account of itself.
+/// Statistics of one host, written by its relay.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct HostReport {
-    /// The host's name.
+pub struct HostStatistics {
+    /// Name of the host.
     pub host: String,
-    /// Whether it launched the run: then its clock is the run's.
+    /// True if it launched the run: its clock is then the run's.
     pub launched: bool,
-    /// What is known of its clock, if it is not the run's.
-    pub clock: Option<ClockReport>,
-    /// What it sent and received, by link.
-    pub links: Vec<LinkEnd>,
-    /// The times in which another host was not heard.
+    /// Its clock relative to the run's; `None` on the launching host.
+    pub clock: Option<ClockStatistics>,
+    /// Its ends of links.
+    pub links: Vec<LinkStatistics>,
+    /// Periods without messages from another host.
     pub silences: Vec<Silence>,
-    /// Frames that were sent again because nothing acknowledged them.
+    /// Frames sent again because they were not acknowledged.
     pub repeated_frames: u64,
-    /// Frames that found no room while nothing came through.
+    /// Frames dropped because the queue of unacknowledged ones was full.
     pub refused_frames: u64,
-    /// Messages that were none.
+    /// Malformed messages received.
     pub malformed: u64,
 }
 
-/// What is known of a host's clock.
+/// Statistics of a host's clock.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct ClockReport {
+pub struct ClockStatistics {
     /// `estimated` or `system`.
     pub source: String,
     /// The run's clock less this host's when the ticks began, ns.
     pub offset_ns: i64,
-    /// How much faster the run's clock goes, parts per million, at the end.
+    /// Rate of the run's clock relative to this host's, at the end, parts per million.
     pub drift_ppm: f64,
-    /// The bound on the error when the ticks began, µs, and the largest one of the run.
+    /// The bound on the offset's error when the ticks began, µs.
     pub error_us: f64,
-    /// See `error_us`.
+    /// The largest bound of the run, µs.
     pub error_max_us: f64,
-    /// The fastest way there and back, µs.
+    /// The fastest recent round trip, µs.
     pub round_trip_us: f64,
-    /// How often the correction was renewed while the run lasted, and the largest one, µs.
+    /// Number of corrections of this host's clock.
     pub corrections: u64,
-    /// See `corrections`.
+    /// The largest correction, µs.
     pub largest_correction_us: f64,
-    /// The estimate each second: seconds since this host asked for the time first, offset less `offset_ns`, µs, and bound, µs.
+    /// One entry per second: seconds since the first time request, the correction's offset less `offset_ns`, µs, and the bound, µs.
     pub track: Vec<[f64; 3]>,
 }
 
-/// One end of a link that crosses hosts.
+/// Counters of a link between hosts, of one end or of both.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct LinkEnd {
-    /// The service.
+pub struct LinkStatistics {
+    /// The signal.
     pub service: String,
-    /// The host that sends.
+    /// The sending host.
     pub from: String,
-    /// The host that receives.
+    /// The receiving host.
     pub to: String,
-    /// Whether it goes by the stream that loses nothing.
+    /// True if the link uses the lossless stream.
     pub lossless: bool,
-    /// Samples sent, by the sending host.
+    /// Samples sent, counted by the sending host.
     pub sent: Option<u64>,
-    /// Samples received, by the receiving host.
+    /// Samples received, counted by the receiving host.
     pub received: Option<u64>,
-    /// Samples that did not come, or later than their successor.
+    /// Samples that did not arrive before their successor.
     pub lost: u64,
-    /// Samples that came a second time, or later than their successor: not passed on.
+    /// Samples that arrived again, or after their successor; not passed on.
     pub stale: u64,
-    /// From the sending role to the receiving host's memory; in real time.
+    /// Time from the sending role to the receiving host's shared memory, in real time.
     pub one_way: Option<Percentiles>,
 }
 
-/// A time in which a host was not heard.
+/// A period without messages from a host.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Silence {
-    /// The host.
-    pub of: String,
-    /// The tick that was due when it fell silent; in lockstep 0.
+    /// The silent host.
+    #[serde(rename = "of")]
+    pub host: String,
+    /// The tick that was due when the silence was found; 0 in lockstep.
     pub tick: u64,
-    /// How long it lasted, s.
+    /// Its duration, s.
     pub seconds: f64,
-    /// Whether it was heard again.
+    /// True if messages arrived again.
     pub healed: bool,
 }
 
-/// The file in a domain's directory in which a relay leaves its report.
+/// Returns the file in a domain's directory to which a relay writes its statistics.
 pub fn relay_report_path(root: &Path, host: &str) -> PathBuf {
     root.join(format!("{host}.relay.json"))
 }
 
-/// The file in a domain's directory in which the launcher of a host that joined leaves how it ended.
+/// Returns the file in a domain's directory to which the launcher of a joined host writes how its part of the run ended.
 pub fn far_end_path(root: &Path, host: &str) -> PathBuf {
     root.join(format!("{host}.host.json"))
 }
 
-/// The file in a domain's directory that is there once its relay is ready.
+/// Returns the file in a domain's directory that exists once its relay is ready.
 pub fn ready_path(root: &Path) -> PathBuf {
     root.join("relay.ready")
 }
 
-/// The part of each host in a run, and both ends of every link between them.
+/// Statistics of all hosts of a run, and of the links between them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct HostsSummary {
-    /// Each host without its links, the one that launched among them.
-    pub hosts: Vec<HostReport>,
-    /// Every link between hosts, in the order in which they were told.
-    pub links: Vec<LinkEnd>,
+pub struct NetworkStatistics {
+    /// All hosts, without their links.
+    pub hosts: Vec<HostStatistics>,
+    /// All links between hosts, each with the counters of both ends.
+    pub links: Vec<LinkStatistics>,
 }
 
-impl HostsSummary {
-    /// That of all hosts' reports; none where there are none.
-    pub fn of(reports: &[HostReport]) -> Option<Self> {
+impl NetworkStatistics {
+    /// Merges the statistics of all hosts; `None` without any.
+    pub fn merge(reports: &[HostStatistics]) -> Option<Self> {
         if reports.is_empty() {
             return None;
         }
-        let mut links: Vec<LinkEnd> = Vec::new();
+        let mut links: Vec<LinkStatistics> = Vec::new();
         for end in reports.iter().flat_map(|report| &report.links) {
-            let same =
-                |link: &&mut LinkEnd| (&link.service, &link.from, &link.to) == (&end.service, &end.from, &end.to);
+            let same = |link: &&mut LinkStatistics| {
+                (&link.service, &link.from, &link.to) == (&end.service, &end.from, &end.to)
+            };
             match links.iter_mut().find(same) {
                 Some(link) => {
                     link.sent = link.sent.or(end.sent);
@@ -130,38 +132,38 @@ impl HostsSummary {
             }
         }
         for link in &mut links {
-            // Of what did not come at the very end the receiver knows nothing.
+            // The receiver cannot count samples that were lost after the last one it received.
             if let (Some(sent), Some(received)) = (link.sent, link.received) {
                 link.lost = sent.saturating_sub(received);
             }
         }
-        let bare = |report: &HostReport| HostReport { links: Vec::new(), ..report.clone() };
-        Some(Self { hosts: reports.iter().map(bare).collect(), links })
+        let without_links = |report: &HostStatistics| HostStatistics { links: Vec::new(), ..report.clone() };
+        Some(Self { hosts: reports.iter().map(without_links).collect(), links })
     }
 
-    /// What does not add up between the ends of links.
+    /// Returns a sentence for each link whose ends disagree.
     pub fn problems(&self) -> Vec<String> {
         let wrong = self.links.iter().filter(|link| match (link.sent, link.received) {
             (Some(sent), Some(received)) => received > sent || (link.lossless && received != sent),
             _ => true,
         });
-        let count = |count: Option<u64>| count.map_or("nobody knows how many".to_owned(), |count| count.to_string());
-        let words = |link: &LinkEnd| {
-            let LinkEnd { service, from, to, .. } = link;
+        let count = |count: Option<u64>| count.map_or("an unknown number".to_owned(), |count| count.to_string());
+        let sentence = |link: &LinkStatistics| {
+            let LinkStatistics { service, from, to, .. } = link;
             format!("{service} from {from} to {to}: {} sent, {} received", count(link.sent), count(link.received))
         };
-        wrong.map(words).collect()
+        wrong.map(sentence).collect()
     }
 
-    /// The largest bound on the error of any host's clock, µs.
+    /// Returns the largest bound on the error of any host's clock, µs.
     pub fn clock_error_us(&self) -> f64 {
         self.hosts.iter().filter_map(|host| host.clock.as_ref()).map(|clock| clock.error_max_us).fold(0.0, f64::max)
     }
 
-    /// Samples of a signal that did not come to the host that launched.
+    /// Returns the number of samples of a signal that did not reach the launching host.
     pub fn lost(&self, service: &str) -> u64 {
         let hub = self.hosts.iter().find(|host| host.launched);
-        let here = |link: &&LinkEnd| link.service == service && hub.is_some_and(|hub| hub.host == link.to);
+        let here = |link: &&LinkStatistics| link.service == service && hub.is_some_and(|hub| hub.host == link.to);
         self.links.iter().filter(here).map(|link| link.lost).sum()
     }
 }
@@ -170,8 +172,8 @@ impl HostsSummary {
 mod tests {
     use super::*;
 
-    fn end(sent: Option<u64>, received: Option<u64>, lossless: bool) -> LinkEnd {
-        LinkEnd {
+    fn end(sent: Option<u64>, received: Option<u64>, lossless: bool) -> LinkStatistics {
+        LinkStatistics {
             service: "s".to_owned(),
             from: "a".to_owned(),
             to: "b".to_owned(),
@@ -184,25 +186,25 @@ mod tests {
         }
     }
 
-    fn summary(sent: Option<u64>, received: Option<u64>, lossless: bool) -> HostsSummary {
-        let host = |name: &str, link| HostReport {
+    fn summary(sent: Option<u64>, received: Option<u64>, lossless: bool) -> NetworkStatistics {
+        let host = |name: &str, link| HostStatistics {
             host: name.to_owned(),
             launched: name == "b",
             links: vec![link],
-            ..HostReport::default()
+            ..HostStatistics::default()
         };
         let reports = [host("a", end(sent, None, lossless)), host("b", end(None, received, lossless))];
-        HostsSummary::of(&reports).unwrap()
+        NetworkStatistics::merge(&reports).unwrap()
     }
 
     #[test]
-    fn both_ends_of_a_link_are_held_against_each_other() {
+    fn a_link_whose_ends_disagree_is_a_problem() {
         let lossy = summary(Some(10), Some(8), false);
         assert_eq!((lossy.links.len(), lossy.lost("s"), lossy.lost("t")), (1, 2, 0));
         assert!(lossy.problems().is_empty());
         assert_eq!(summary(Some(10), Some(8), true).problems(), ["s from a to b: 10 sent, 8 received"]);
         assert_eq!(summary(Some(8), Some(10), false).problems().len(), 1);
-        assert_eq!(summary(None, Some(10), false).problems().len(), 1, "one end is silent");
-        assert_eq!(HostsSummary::of(&[]), None);
+        assert_eq!(summary(None, Some(10), false).problems().len(), 1, "the sender's counter is missing");
+        assert_eq!(NetworkStatistics::merge(&[]), None);
     }
 }

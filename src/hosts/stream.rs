@@ -1,48 +1,56 @@
-//! Both ends of a stream that loses nothing over a way that may: numbered frames, repeated until they are acknowledged, so many under
-//! way at the most. Pure: bytes in, bytes out, time is an argument. Must not know what a frame holds.
+//! Both ends of a lossless stream over a lossy connection: numbered frames, repeated until they are acknowledged (go-back-N), with at
+//! most [`WINDOW`] in flight.
+//!
+//! Pure: bytes in, bytes out, time is an argument. Must not interpret a frame.
 
 use std::collections::VecDeque;
 
-/// Frames under way at the most.
+/// Largest number of frames in flight.
 const WINDOW: usize = 256;
-/// What is not acknowledged for so many times the usual is sent again, and never sooner, nor later, than so, ns.
-const PATIENCE: u64 = 4;
+/// Timeout of an acknowledgement, as a multiple of the usual round trip.
+const TIMEOUT_FACTOR: u64 = 4;
+/// The shortest timeout, the one before any measurement, and the longest, ns.
 const REPEAT_MIN_NS: u64 = 10_000_000;
 const REPEAT_NS: u64 = 100_000_000;
 const REPEAT_MAX_NS: u64 = 800_000_000;
-/// So many acknowledgements that lack the same frame tell that it is lost.
+/// Number of acknowledgements that lack the same frame after which it counts as lost.
 const LACKING: u32 = 3;
 
 /// The sending end.
 #[derive(Debug)]
 pub struct Sender {
-    /// The number of the first frame that is kept.
+    /// Number of the first frame in `frames`.
     first: u64,
+    /// Unacknowledged frames.
     frames: VecDeque<Vec<u8>>,
-    /// How many of these are under way.
-    under_way: usize,
+    /// Number of these that are in flight.
+    in_flight: usize,
     capacity: usize,
+    /// Time of the last acknowledged or repeated frame, ns.
     progress_ns: u64,
-    patience_ns: u64,
-    /// How long an acknowledgement takes as a rule, ns; and a frame by which that is measured, with the time when it was sent.
-    usual_ns: Option<u64>,
+    /// The current timeout, ns.
+    timeout_ns: u64,
+    /// Moving average of the round trip, ns.
+    round_trip_ns: Option<u64>,
+    /// The frame that measures the round trip, with the time at which it was sent.
     measured: Option<(u64, u64)>,
+    /// Number of acknowledgements in a row that lack the first frame.
     lacking: u32,
     repeated: u64,
     refused: u64,
 }
 
 impl Sender {
-    /// An end that keeps so many frames at the most.
+    /// Creates an end that keeps at most `capacity` frames.
     pub fn new(capacity: usize) -> Self {
         Self {
             first: 0,
             frames: VecDeque::new(),
-            under_way: 0,
+            in_flight: 0,
             capacity,
             progress_ns: 0,
-            patience_ns: REPEAT_NS,
-            usual_ns: None,
+            timeout_ns: REPEAT_NS,
+            round_trip_ns: None,
             measured: None,
             lacking: 0,
             repeated: 0,
@@ -50,7 +58,7 @@ impl Sender {
         }
     }
 
-    /// Takes a frame; false, and it is lost, if too many wait already.
+    /// Appends a frame. Returns false, and drops it, if `capacity` frames are unacknowledged.
     pub fn push(&mut self, frame: Vec<u8>) -> bool {
         let fits = self.frames.len() < self.capacity;
         if fits {
@@ -61,37 +69,37 @@ impl Sender {
         fits
     }
 
-    /// Hands out what is to be sent now, with its number.
+    /// Calls `send` with each frame that is to be sent now, and its number.
     pub fn poll(&mut self, now_ns: u64, mut send: impl FnMut(u64, &[u8])) {
-        if self.under_way == 0 {
+        if self.in_flight == 0 {
             self.progress_ns = now_ns;
-        } else if now_ns.saturating_sub(self.progress_ns) >= self.patience_ns {
+        } else if now_ns.saturating_sub(self.progress_ns) >= self.timeout_ns {
             self.go_back(now_ns);
-            self.patience_ns = (2 * self.patience_ns).min(REPEAT_MAX_NS);
+            self.timeout_ns = (2 * self.timeout_ns).min(REPEAT_MAX_NS);
         }
-        if self.measured.is_none() && self.under_way == 0 && !self.frames.is_empty() {
+        if self.measured.is_none() && self.in_flight == 0 && !self.frames.is_empty() {
             self.measured = Some((self.first, now_ns));
         }
-        while self.under_way < self.frames.len().min(WINDOW) {
-            send(self.first + self.under_way as u64, &self.frames[self.under_way]);
-            self.under_way += 1;
+        while self.in_flight < self.frames.len().min(WINDOW) {
+            send(self.first + self.in_flight as u64, &self.frames[self.in_flight]);
+            self.in_flight += 1;
         }
     }
 
-    /// Begins again with the first: whoever waits for it takes none of the others.
+    /// Starts again at the first frame: the receiver drops all frames after a missing one.
     fn go_back(&mut self, now_ns: u64) {
-        self.repeated += self.under_way as u64;
-        (self.under_way, self.progress_ns, self.lacking) = (0, now_ns, 0);
-        // Of a frame that was sent twice nobody knows which one is acknowledged.
+        self.repeated += self.in_flight as u64;
+        (self.in_flight, self.progress_ns, self.lacking) = (0, now_ns, 0);
+        // An acknowledgement of a repeated frame does not tell which copy it is for, so it measures nothing.
         self.measured = Some((u64::MAX, 0));
     }
 
     /// Takes an acknowledgement of all frames before `next`.
-    pub fn acknowledged(&mut self, next: u64, now_ns: u64) {
-        if next == self.first && self.under_way > 0 {
+    pub fn acknowledge(&mut self, next: u64, now_ns: u64) {
+        if next == self.first && self.in_flight > 0 {
             self.lacking += 1;
-            // What was under way when it was sent again is still being acknowledged.
-            let long_enough = now_ns.saturating_sub(self.progress_ns) >= self.usual_ns.unwrap_or(REPEAT_NS);
+            // Frames that were in flight before the last repetition are still being acknowledged.
+            let long_enough = now_ns.saturating_sub(self.progress_ns) >= self.round_trip_ns.unwrap_or(REPEAT_NS);
             if self.lacking >= LACKING && long_enough {
                 self.go_back(now_ns);
             }
@@ -100,33 +108,34 @@ impl Sender {
         if done > 0 {
             self.frames.drain(..done);
             self.first += done as u64;
-            self.under_way = self.under_way.saturating_sub(done);
+            self.in_flight = self.in_flight.saturating_sub(done);
             match self.measured {
                 Some((number, sent_ns)) if number < next => {
                     let took_ns = now_ns.saturating_sub(sent_ns);
-                    self.usual_ns = Some(self.usual_ns.map_or(took_ns, |usual_ns| (7 * usual_ns + took_ns) / 8));
+                    self.round_trip_ns =
+                        Some(self.round_trip_ns.map_or(took_ns, |round_trip_ns| (7 * round_trip_ns + took_ns) / 8));
                     self.measured = None;
                 }
                 Some((u64::MAX, _)) => self.measured = None,
                 _ => {}
             }
-            let usual_ns = self.usual_ns.unwrap_or(REPEAT_NS / PATIENCE);
-            self.patience_ns = (PATIENCE * usual_ns).clamp(REPEAT_MIN_NS, REPEAT_MAX_NS);
+            let round_trip_ns = self.round_trip_ns.unwrap_or(REPEAT_NS / TIMEOUT_FACTOR);
+            self.timeout_ns = (TIMEOUT_FACTOR * round_trip_ns).clamp(REPEAT_MIN_NS, REPEAT_MAX_NS);
             (self.progress_ns, self.lacking) = (now_ns, 0);
         }
     }
 
-    /// Whether everything has been acknowledged.
+    /// Returns true once all frames have been acknowledged.
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()
     }
 
-    /// Frames that were sent again.
+    /// Returns the number of repeated frames.
     pub fn repeated(&self) -> u64 {
         self.repeated
     }
 
-    /// Frames that found no room.
+    /// Returns the number of dropped frames.
     pub fn refused(&self) -> u64 {
         self.refused
     }
@@ -136,21 +145,22 @@ impl Sender {
 #[derive(Debug, Default)]
 pub struct Receiver {
     next: u64,
-    owes: bool,
+    /// True while a received frame is not acknowledged.
+    pending: bool,
 }
 
 impl Receiver {
-    /// Takes the frame of a number; true if it is the next one, and to be used.
+    /// Takes the number of a received frame. Returns true if it is the next one, and to be used.
     pub fn take(&mut self, number: u64) -> bool {
-        self.owes = true;
+        self.pending = true;
         let next = number == self.next;
         self.next += u64::from(next);
         next
     }
 
-    /// The acknowledgement that is owed, if one is.
+    /// Returns the acknowledgement to send, if frames have arrived since the last one.
     pub fn acknowledgement(&mut self) -> Option<u64> {
-        std::mem::take(&mut self.owes).then_some(self.next)
+        std::mem::take(&mut self.pending).then_some(self.next)
     }
 }
 
@@ -160,35 +170,34 @@ mod tests {
     use proptest::prelude::*;
 
     proptest! {
-        /// Whatever the way loses, doubles or turns round, all frames come, in order, each once.
         #[test]
-        fn nothing_is_lost_and_nothing_comes_twice(fate in prop::collection::vec(0_u8..10, 2000..4000), count in 1_usize..600) {
+        fn all_frames_arrive_once_and_in_order_over_a_connection_that_loses_doubles_and_reorders(fate in prop::collection::vec(0_u8..10, 2000..4000), count in 1_usize..600) {
             let (mut sender, mut receiver) = (Sender::new(usize::MAX), Receiver::default());
             (0..count).for_each(|n| assert!(sender.push(n.to_le_bytes().to_vec())));
-            let (mut fate, mut got, mut way) = (fate.into_iter().cycle(), Vec::new(), Vec::new());
+            let (mut fate, mut received, mut network) = (fate.into_iter().cycle(), Vec::new(), Vec::new());
             let mut now_ns = 0;
             while !sender.is_empty() {
                 now_ns += 10_000_000;
-                prop_assert!(now_ns < 3_600_000_000_000, "it comes to no end");
-                sender.poll(now_ns, |number, frame| way.push((number, frame.to_vec())));
-                for (number, frame) in std::mem::take(&mut way) {
-                    let copies = match fate.next() { Some(0) => 0, Some(1) => 2, Some(2) => { way.push((number, frame)); continue } _ => 1 };
+                prop_assert!(now_ns < 3_600_000_000_000, "the stream does not finish");
+                sender.poll(now_ns, |number, frame| network.push((number, frame.to_vec())));
+                for (number, frame) in std::mem::take(&mut network) {
+                    let copies = match fate.next() { Some(0) => 0, Some(1) => 2, Some(2) => { network.push((number, frame)); continue } _ => 1 };
                     for _ in 0..copies {
                         if receiver.take(number) {
-                            got.push(usize::from_le_bytes(frame.clone().try_into().unwrap()));
+                            received.push(usize::from_le_bytes(frame.clone().try_into().unwrap()));
                         }
                     }
                 }
                 if let Some(next) = receiver.acknowledgement().filter(|_| fate.next() != Some(0)) {
-                    sender.acknowledged(next, now_ns);
+                    sender.acknowledge(next, now_ns);
                 }
             }
-            prop_assert_eq!(got, (0..count).collect::<Vec<_>>());
+            prop_assert_eq!(received, (0..count).collect::<Vec<_>>());
         }
     }
 
     #[test]
-    fn what_is_under_way_is_bounded_and_so_is_what_waits() {
+    fn frames_in_flight_and_unacknowledged_frames_are_bounded() {
         let mut sender = Sender::new(WINDOW + 5);
         let taken = (0..WINDOW + 7).filter(|_| sender.push(Vec::new())).count();
         assert_eq!((taken, sender.refused()), (WINDOW + 5, 2));
@@ -196,11 +205,11 @@ mod tests {
         sender.poll(0, |number, _| sent.push(number));
         sender.poll(1, |number, _| sent.push(number));
         assert_eq!(sent.len(), WINDOW);
-        sender.acknowledged(3, 2);
-        sender.acknowledged(2, 2);
+        sender.acknowledge(3, 2);
+        sender.acknowledge(2, 2);
         sender.poll(2, |number, _| sent.push(number));
         assert_eq!(sent.last(), Some(&(WINDOW as u64 + 2)));
         sender.poll(2 + REPEAT_NS, |number, _| sent.push(number));
-        assert_eq!((sender.repeated(), sent[WINDOW + 3]), (WINDOW as u64, 3), "again, from the first that is lacked");
+        assert_eq!((sender.repeated(), sent[WINDOW + 3]), (WINDOW as u64, 3), "repeated from the first missing frame");
     }
 }

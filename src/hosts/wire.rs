@@ -1,44 +1,47 @@
-//! What hosts send one another, as bytes. Pure. What comes from a network may be anything: it is read or refused, and never trusted
-//! with a length. Must not know what a sample means.
+//! The messages between hosts, as bytes. Pure.
+//!
+//! Bytes from a network may be anything: they are decoded or refused, and a length in them is never trusted. Must not interpret a
+//! sample.
 
 /// A message, and the number of the host that sent it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Message<'a> {
     /// The number of the sender.
     pub from: u8,
-    /// What it says.
-    pub what: What<'a>,
+    /// The payload.
+    pub payload: Payload<'a>,
 }
 
-/// What a message says.
+/// The payload of a message.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum What<'a> {
-    /// The sample of a link, which may be lost: its number among those of this link to this host, and its bytes.
+pub enum Payload<'a> {
+    /// A sample of a link that may lose it: its number among those of this link to this host, and its bytes.
     Sample { link: u16, number: u64, sample: &'a [u8] },
-    /// A frame of the stream that loses nothing.
+    /// A frame of the lossless stream.
     Frame { number: u64, content: &'a [u8] },
-    /// All frames before this one have come.
+    /// An acknowledgement of all frames before this one.
     Acknowledge { next: u64 },
-    /// How a role is: its number, and the bytes of its health.
+    /// A heartbeat of a role: the role's number, and the bytes of the sample.
     Health { role: u16, sample: &'a [u8] },
-    /// The launcher's word.
+    /// An announcement of the launcher.
     Schedule { sample: &'a [u8] },
-    /// A question for the time: when it was sent there.
+    /// A time request: when it was sent, on the sender's clock.
     Ping { sent_ns: u64 },
-    /// The answer: that time, when it came and went here, and from this host's monotonic clock to its CLOCK_TAI.
+    /// The answer to a time request: its `sent_ns`, when it was received and answered on the answering host's clock, and that host's
+    /// CLOCK_TAI less its monotonic clock.
     Pong { sent_ns: u64, received_ns: u64, answered_ns: u64, tai_offset_ns: u64 },
 }
 
-/// What a frame of the stream holds.
+/// The content of a frame of the lossless stream.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Content<'a> {
-    /// The sample of a link.
+    /// A sample of a link.
     Sample { link: u16, sample: &'a [u8] },
-    /// A file of the run's directory: its name, and what is in it.
+    /// A file of the run's directory: its name and its bytes.
     File { name: &'a str, bytes: &'a [u8] },
 }
 
-/// Reads from the front.
+/// Reads bytes from the front.
 struct Cursor<'a>(&'a [u8]);
 
 impl<'a> Cursor<'a> {
@@ -66,7 +69,7 @@ impl<'a> Cursor<'a> {
 }
 
 impl<'a> Message<'a> {
-    /// Its bytes.
+    /// Returns the bytes.
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = vec![self.from];
         let mut put = |kind: u8, short: Option<u16>, longs: &[u64], rest: &[u8]| {
@@ -76,50 +79,50 @@ impl<'a> Message<'a> {
             longs.iter().for_each(|long| bytes.extend(long.to_le_bytes()));
             bytes.extend(rest);
         };
-        match self.what {
-            What::Sample { link, number, sample } => put(0, Some(link), &[number], sample),
-            What::Frame { number, content } => put(1, None, &[number], content),
-            What::Acknowledge { next } => put(2, None, &[next], &[]),
-            What::Health { role, sample } => put(3, Some(role), &[], sample),
-            What::Schedule { sample } => put(4, None, &[], sample),
-            What::Ping { sent_ns } => put(5, None, &[sent_ns], &[]),
-            What::Pong { sent_ns, received_ns, answered_ns, tai_offset_ns } => {
+        match self.payload {
+            Payload::Sample { link, number, sample } => put(0, Some(link), &[number], sample),
+            Payload::Frame { number, content } => put(1, None, &[number], content),
+            Payload::Acknowledge { next } => put(2, None, &[next], &[]),
+            Payload::Health { role, sample } => put(3, Some(role), &[], sample),
+            Payload::Schedule { sample } => put(4, None, &[], sample),
+            Payload::Ping { sent_ns } => put(5, None, &[sent_ns], &[]),
+            Payload::Pong { sent_ns, received_ns, answered_ns, tai_offset_ns } => {
                 put(6, None, &[sent_ns, received_ns, answered_ns, tai_offset_ns], &[]);
             }
         }
         bytes
     }
 
-    /// The message in these bytes, if they are one.
+    /// Returns the message in these bytes, or `None` if they are malformed.
     pub fn decode(bytes: &'a [u8]) -> Option<Self> {
         let mut cursor = Cursor(bytes);
         let (from, kind) = (cursor.byte()?, cursor.byte()?);
-        let what = match kind {
-            0 => What::Sample { link: cursor.short()?, number: cursor.long()?, sample: cursor.0 },
-            1 => What::Frame { number: cursor.long()?, content: cursor.0 },
+        let payload = match kind {
+            0 => Payload::Sample { link: cursor.short()?, number: cursor.long()?, sample: cursor.0 },
+            1 => Payload::Frame { number: cursor.long()?, content: cursor.0 },
             2 => {
                 let next = cursor.long()?;
-                cursor.end(What::Acknowledge { next })?
+                cursor.end(Payload::Acknowledge { next })?
             }
-            3 => What::Health { role: cursor.short()?, sample: cursor.0 },
-            4 => What::Schedule { sample: cursor.0 },
+            3 => Payload::Health { role: cursor.short()?, sample: cursor.0 },
+            4 => Payload::Schedule { sample: cursor.0 },
             5 => {
                 let sent_ns = cursor.long()?;
-                cursor.end(What::Ping { sent_ns })?
+                cursor.end(Payload::Ping { sent_ns })?
             }
             6 => {
                 let (sent_ns, received_ns) = (cursor.long()?, cursor.long()?);
                 let (answered_ns, tai_offset_ns) = (cursor.long()?, cursor.long()?);
-                cursor.end(What::Pong { sent_ns, received_ns, answered_ns, tai_offset_ns })?
+                cursor.end(Payload::Pong { sent_ns, received_ns, answered_ns, tai_offset_ns })?
             }
             _ => return None,
         };
-        Some(Self { from, what })
+        Some(Self { from, payload })
     }
 }
 
 impl<'a> Content<'a> {
-    /// Its bytes.
+    /// Returns the bytes.
     pub fn encode(&self) -> Vec<u8> {
         match *self {
             Self::Sample { link, sample } => [&[0], &link.to_le_bytes()[..], sample].concat(),
@@ -129,7 +132,7 @@ impl<'a> Content<'a> {
         }
     }
 
-    /// The content in these bytes, if they are one. A file's name is one: it leads nowhere.
+    /// Returns the content in these bytes, or `None` if they are malformed. A file's name contains no path.
     pub fn decode(bytes: &'a [u8]) -> Option<Self> {
         let mut cursor = Cursor(bytes);
         Some(match cursor.byte()? {
@@ -154,18 +157,18 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_written_is_read(from: u8, short: u16, a: u64, b: u64, rest in prop::collection::vec(any::<u8>(), 0..200)) {
+        fn decoding_inverts_encoding(from: u8, short: u16, a: u64, b: u64, rest in prop::collection::vec(any::<u8>(), 0..200)) {
             let all = [
-                What::Sample { link: short, number: a, sample: &rest },
-                What::Frame { number: a, content: &rest },
-                What::Acknowledge { next: a },
-                What::Health { role: short, sample: &rest },
-                What::Schedule { sample: &rest },
-                What::Ping { sent_ns: a },
-                What::Pong { sent_ns: a, received_ns: b, answered_ns: a, tai_offset_ns: b },
+                Payload::Sample { link: short, number: a, sample: &rest },
+                Payload::Frame { number: a, content: &rest },
+                Payload::Acknowledge { next: a },
+                Payload::Health { role: short, sample: &rest },
+                Payload::Schedule { sample: &rest },
+                Payload::Ping { sent_ns: a },
+                Payload::Pong { sent_ns: a, received_ns: b, answered_ns: a, tai_offset_ns: b },
             ];
-            for what in all {
-                let message = Message { from, what };
+            for payload in all {
+                let message = Message { from, payload };
                 let bytes = message.encode();
                 prop_assert_eq!(Message::decode(&bytes), Some(message.clone()));
             }
@@ -176,7 +179,7 @@ mod tests {
         }
 
         #[test]
-        fn anything_may_come(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
+        fn decoded_bytes_encode_to_themselves(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
             if let Some(message) = Message::decode(&bytes) {
                 prop_assert_eq!(message.encode(), bytes.clone());
             }
@@ -187,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_lies_in_its_directory() {
+    fn a_file_name_with_a_path_is_refused() {
         for name in ["", "../x", "/etc/x", ".x", "a/b", "a b", "a\0"] {
             assert_eq!(Content::decode(&Content::File { name, bytes: b"x" }.encode()), None, "{name}");
         }

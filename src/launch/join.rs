@@ -13,7 +13,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{self, RunClock, monotonic_ns, raw_ns};
 use crate::config::ClockKind;
-use crate::hosts::{HostSeat, RELAY, far_end_path};
+use crate::hosts::{HostEndpoint, RELAY, far_end_path};
 use crate::runtime::{depths, hold_low_latency_idle, request_short_slices, topic};
 use crate::sample::{Phase, RoleState, Schedule};
 use crate::scenario::Scenario;
@@ -48,7 +48,7 @@ pub struct FarOutcome {
 pub fn join(
     scenario: &Scenario,
     owned: OwnedDomain,
-    seat: &HostSeat,
+    seat: &HostEndpoint,
     hub: &str,
     launch: &mut Launch<'_>,
 ) -> Result<FarOutcome, LaunchError> {

@@ -1,6 +1,6 @@
 //! What the caller of a run gives, and what it is told meanwhile.
 
-use crate::hosts::HostSeat;
+use crate::hosts::HostEndpoint;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicUsize;
@@ -16,7 +16,7 @@ pub struct Launch<'a> {
     /// Where to show the run on a Foxglove WebSocket; not in one thread, and only by a program that was built with it.
     pub foxglove: Option<SocketAddr>,
     /// This host's part in a run over several, which others join; without it all roles run here.
-    pub host: Option<HostSeat>,
+    pub host: Option<HostEndpoint>,
     /// Refuse to run without every privilege that was asked for.
     pub require_realtime: bool,
     /// Whether the hash is kept of the ticks on the way too, by which two runs are compared; a run in one thread may do without.

@@ -6,7 +6,7 @@ use super::Score;
 use super::incident::Incident;
 use super::remains::Remains;
 use crate::config::ClockKind;
-use crate::hosts::{HostReport, HostsSummary};
+use crate::hosts::{HostStatistics, NetworkStatistics};
 use crate::record::RecordingReport;
 use crate::runtime::{RoleId, ports};
 use crate::scenario::Scenario;
@@ -29,7 +29,7 @@ pub struct Outcome {
     /// Roles that failed while the ticks ran.
     pub incidents: Vec<Incident>,
     /// What hosts tell of their part, if there are several.
-    pub hosts: Vec<HostReport>,
+    pub hosts: Vec<HostStatistics>,
     /// The launcher's own privileges.
     pub grants: Vec<Grant>,
     /// What was recorded, if that was asked for.
@@ -176,7 +176,7 @@ impl Accounting {
             }
         }
         if !interrupted {
-            problems.extend(HostsSummary::of(&outcome.hosts).iter().flat_map(HostsSummary::problems));
+            problems.extend(NetworkStatistics::merge(&outcome.hosts).iter().flat_map(NetworkStatistics::problems));
         }
         let mut links = Vec::new();
         for (report, read) in reports.iter().flat_map(|report| report.read.iter().map(move |read| (report, read))) {

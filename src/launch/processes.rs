@@ -22,7 +22,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Signal, Write};
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::ClockKind;
-use crate::hosts::{HostsSummary, RELAY};
+use crate::hosts::{NetworkStatistics, RELAY};
 use crate::record::RECORDER;
 use crate::runtime::{
     Backoff, RoleId, depths, hold_low_latency_idle, report, request_short_slices, shared_memory_bytes, topic,
@@ -104,7 +104,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     }
     let score = scorer.finish()?;
     let (incidents, recorder) = (supervisor.incidents.finish(&score.recoveries_s), supervisor.recorder);
-    let recording = recorder.finish(domain, &reports, HostsSummary::of(&hosts).as_ref());
+    let recording = recorder.finish(domain, &reports, NetworkStatistics::merge(&hosts).as_ref());
     let domain = Some(domain.root().to_owned());
     let remains = Some(Remains::new(bus, owned, janitor));
     Ok(Outcome { reports, unbooked, problems, score, incidents, hosts, grants, recording, domain, signal, remains })

@@ -10,7 +10,7 @@ use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::monotonic_ns;
-use crate::hosts::HostsSummary;
+use crate::hosts::NetworkStatistics;
 use crate::record::{JOINING, RECORDER, RecordingReport};
 use crate::runtime::topic;
 use crate::sample::{Health, RoleState};
@@ -115,7 +115,7 @@ impl RecorderWatch {
         mut self,
         domain: &Domain,
         roles: &[RoleReport],
-        hosts: Option<&HostsSummary>,
+        hosts: Option<&NetworkStatistics>,
     ) -> Option<RecordingReport> {
         let file = self.file.take()?;
         let late = self.companion.lingers();

@@ -7,7 +7,7 @@ use super::children::RoleProcess;
 use super::companion::Companion;
 use super::incident::{Action, Failure, Incident, Incidents};
 use crate::bus::domain::Domain;
-use crate::hosts::{HostReport, HostSeat, RELAY, far_end_path, ready_path, relay_report_path};
+use crate::hosts::{HostEndpoint, HostStatistics, RELAY, far_end_path, ready_path, relay_report_path};
 use crate::runtime::RoleId;
 use crate::scenario::Scenario;
 use serde::{Deserialize, Serialize};
@@ -38,7 +38,7 @@ pub(super) struct RelayWatch {
 impl RelayWatch {
     /// Starts the relay of a host, if there is a `seat`, in a run that `hub` launched.
     pub fn start(
-        seat: Option<&HostSeat>,
+        seat: Option<&HostEndpoint>,
         hub: &str,
         scenario: &Scenario,
         domain: &Domain,
@@ -96,12 +96,12 @@ impl RelayWatch {
     }
 
     /// Returns the hosts' final reports: accounts, errors, and incidents that are not in `known`.
-    pub fn finish(&mut self, known: &Incidents) -> (Vec<HostReport>, Vec<String>, Vec<Incident>) {
+    pub fn finish(&mut self, known: &Incidents) -> (Vec<HostStatistics>, Vec<String>, Vec<Incident>) {
         self.companion.process().1.map(RoleProcess::kill);
         let (mut reports, mut problems, mut incidents) = (Vec::new(), Vec::new(), Vec::new());
         for (host, _) in &self.hosts {
             let report = std::fs::read(relay_report_path(&self.root, host)).ok();
-            reports.extend(report.and_then(|bytes| serde_json::from_slice::<HostReport>(&bytes).ok()));
+            reports.extend(report.and_then(|bytes| serde_json::from_slice::<HostStatistics>(&bytes).ok()));
             if let Some(end) = far_end(&self.root, host) {
                 problems.extend(end.problems.iter().map(|problem| format!("{host}: {problem}")));
                 incidents.extend(end.incidents.into_iter().filter(|incident| !known.contains(incident)));

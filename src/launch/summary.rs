@@ -10,7 +10,7 @@ use super::results::{HASHES, LATENCY, LATENCY_LOG, SCENARIO, SUMMARY};
 use crate::analysis::Claim;
 use crate::config::{ClockKind, RunId};
 use crate::files;
-use crate::hosts::HostsSummary;
+use crate::hosts::NetworkStatistics;
 use crate::record::RecordingReport;
 use crate::rig::Figure;
 use crate::runtime::RoleId;
@@ -84,7 +84,7 @@ pub struct Summary {
     pub lines: BTreeMap<String, LineCounters>,
     /// The part of each host, if the run had several.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub hosts: Option<HostsSummary>,
+    pub hosts: Option<NetworkStatistics>,
     /// What was recorded, if that was asked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub recording: Option<RecordingReport>,
@@ -190,7 +190,7 @@ impl Summary {
             books,
             latencies,
             lines: lines(&outcome.reports),
-            hosts: HostsSummary::of(&outcome.hosts),
+            hosts: NetworkStatistics::merge(&outcome.hosts),
             recording: outcome.recording.clone(),
             privileges: privileges(outcome),
             privileges_unknown: privileges_unknown(scenario, outcome),

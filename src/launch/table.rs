@@ -3,7 +3,7 @@
 use super::outcome::{LinkCounters, State};
 use super::{Incident, Summary, exact, short};
 use crate::analysis::digits;
-use crate::hosts::{HostsSummary, Silence};
+use crate::hosts::{NetworkStatistics, Silence};
 use crate::serial::LineCounters;
 use crate::telemetry::Percentiles;
 use comfy_table::presets::NOTHING;
@@ -292,7 +292,7 @@ pub(crate) fn reasons(rejected_by: &BTreeMap<String, u64>) -> String {
     if all.is_empty() { String::new() } else { format!(" ({})", all.join(", ")) }
 }
 
-fn hosts(summary: &HostsSummary, text: &mut String) {
+fn hosts(summary: &NetworkStatistics, text: &mut String) {
     for host in &summary.hosts {
         let name = &host.host;
         let _ = match &host.clock {
@@ -311,7 +311,7 @@ fn hosts(summary: &HostsSummary, text: &mut String) {
             ),
         };
         for silence in &host.silences {
-            let Silence { of, tick, seconds, healed } = silence;
+            let Silence { host: of, tick, seconds, healed } = silence;
             let end = if *healed { ", then heard again" } else { "" };
             let _ = writeln!(text, "  from tick {tick} on nothing was heard of {of} for {seconds:.2} s{end}");
         }

@@ -142,7 +142,9 @@ mod with_hosts {
 #[cfg(feature = "hosts")]
 mod with_hosts {
     use super::*;
-    use crate::hosts::{HostSeat, JoinError, NetError, Part, RelayError, RelaySeat, Request, ask_to_join, run_relay};
+    use crate::hosts::{
+        Admission, HostEndpoint, JoinError, JoinRequest, NetError, RelayError, RelayOptions, ask_to_join, run_relay,
+    };
     use crate::launch::{FarOutcome, Launch, new_domain};
     use crate::program::output::exit_of;
     use crate::program::output::say;
@@ -153,9 +155,9 @@ mod with_hosts {
 
     pub fn relay(arguments: &RelayArguments, endpoint: Endpoint) -> Ended {
         let terminated = terminated_by_signals()?;
-        let seat = HostSeat { host: arguments.host.clone(), endpoint };
-        let seat = RelaySeat { domain: arguments.domain.clone(), seat, hub: arguments.hub.clone() };
-        run_relay(&seat, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
+        let host = HostEndpoint { host: arguments.host.clone(), endpoint };
+        let options = RelayOptions { domain: arguments.domain.clone(), host, hub: arguments.hub.clone() };
+        run_relay(&options, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
             RelayError::NoHost(..) | RelayError::Clock(_) => fail(Exit::Usage, error),
             _ => fail(Exit::Failure, error),
         })
@@ -183,7 +185,7 @@ mod with_hosts {
         let owned = new_domain(&sized).map_err(|error| fail(exit_of(&error), error))?;
         drop(aside);
         let scenario: Scenario = part.scenario(owned.domain().root()).map_err(refused)?;
-        let seat = HostSeat { host: part.host.clone(), endpoint };
+        let seat = HostEndpoint { host: part.host.clone(), endpoint };
         let mut silent = |_: &crate::launch::Progress<'_>| {};
         let mut launch = Launch::new(&signal, &mut silent);
         let outcome = crate::launch::join(&scenario, owned, &seat, &part.hub, &mut launch);
@@ -199,16 +201,16 @@ mod with_hosts {
     }
 
     /// Asks for a part in the run.
-    fn ask(arguments: &JoinArguments, endpoint: &Endpoint) -> Result<Part, Exit> {
+    fn ask(arguments: &JoinArguments, endpoint: &Endpoint) -> Result<Admission, Exit> {
         let token =
             random_bits().map_err(|error| fail(Exit::Failure, Failure::new("no-random-numbers", error)))? as u64;
-        let request = Request::new(arguments.host.as_deref(), token).encode();
+        let request = JoinRequest::new(arguments.host.as_deref(), token).encode();
         let answer = ask_to_join(endpoint, &request);
         let answer = answer.map_err(|error| {
             let usage = matches!(error, NetError::Key { .. });
             fail(if usage { Exit::Usage } else { Exit::Failure }, error)
         })?;
-        Part::decode(&answer).map_err(refused)
+        Admission::decode(&answer).map_err(refused)
     }
 
     fn refused(error: JoinError) -> Exit {

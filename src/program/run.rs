@@ -11,7 +11,7 @@ use super::signals::catch_signals;
 use crate::config::{ClockKind, RunId};
 use crate::doctor::Machine;
 use crate::files;
-use crate::hosts::{Address, HostSeat};
+use crate::hosts::{Address, HostEndpoint};
 use crate::launch::{
     Action, Launch, Outcome, Progress, ResultsError, Summary, check_cores, claim, exact, junit, make_directory,
     make_latest, new_run, table, tick_words, write_run,
@@ -161,7 +161,7 @@ impl Arguments {
     }
 
     /// This host's part in a run over several.
-    fn seat(&self) -> Result<Option<HostSeat>, Failure> {
+    fn seat(&self) -> Result<Option<HostEndpoint>, Failure> {
         let (Some(host), Some(address)) = (&self.host, &self.listen) else {
             return if self.keys.any() {
                 Err(Failure::new("unused-keys", "--tls-… and --insecure are for --listen"))
@@ -170,11 +170,11 @@ impl Arguments {
             };
         };
         let endpoint = self.keys.endpoint(address.clone())?;
-        Ok(Some(HostSeat { host: host.clone(), endpoint }))
+        Ok(Some(HostEndpoint { host: host.clone(), endpoint }))
     }
 
     fn check_host(&self, scenario: &Scenario) -> Result<(), Failure> {
-        let Some(HostSeat { host, .. }) = self.seat()? else { return Ok(()) };
+        let Some(HostEndpoint { host, .. }) = self.seat()? else { return Ok(()) };
         let refuse = |code, reason: String| Err(Failure::new(code, format!("--host {host}: {reason}")));
         hosts::refusal().map_or(Ok(()), |reason| refuse("built-without", reason.to_owned()))?;
         let names: Vec<&str> = scenario.hosts.hosts.iter().map(|host| &*host.name).collect();

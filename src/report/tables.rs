@@ -4,7 +4,7 @@ use super::model::{Block, Section};
 use super::source::Source;
 use super::traces::Traces;
 use crate::analysis::{Claim, Reach, apart, digits};
-use crate::hosts::{HostReport, LinkEnd, Silence};
+use crate::hosts::{HostStatistics, LinkStatistics, Silence};
 use crate::launch::{Criterion, Incident, LinkCounters, StageFigures, State, exact, reasons, short};
 use crate::rig::{ConditionReport, Figure};
 use crate::telemetry::{MachineInfo, Percentiles, Ticks};
@@ -263,7 +263,7 @@ pub fn books(source: &Source) -> Section {
 /// Returns the tables of hosts and of the links between them, if the run had several hosts.
 fn hosts(source: &Source) -> Vec<Block> {
     let Some(hosts) = source.summary.as_ref().and_then(|summary| summary.hosts.as_ref()) else { return Vec::new() };
-    let clock = |host: &HostReport| {
+    let clock = |host: &HostStatistics| {
         let Some(clock) = &host.clock else {
             return strings(&[&host.host, &"reference", &"–", &"–", &"–", &"–"]);
         };
@@ -275,14 +275,14 @@ fn hosts(source: &Source) -> Vec<Block> {
     let mut blocks = vec![Block::table("Hosts", head, hosts.hosts.iter().map(clock).collect())];
     let silences = hosts.hosts.iter().flat_map(|host| host.silences.iter().map(move |silence| (host, silence)));
     blocks.extend(silences.map(|(host, silence)| {
-        let Silence { of: sender, tick, seconds, healed } = silence;
+        let Silence { host: sender, tick, seconds, healed } = silence;
         let end = if *healed { "; then the link recovered" } else { "" };
         Block::Text(format!(
             "From tick {tick} on, {} received nothing from {sender} for {seconds:.2} s{end}.",
             host.host
         ))
     }));
-    let row = |link: &LinkEnd| {
+    let row = |link: &LinkStatistics| {
         let us = |percentile: fn(&Percentiles) -> f64| {
             link.one_way
                 .filter(Percentiles::are_shown)

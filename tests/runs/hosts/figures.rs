@@ -1,4 +1,4 @@
-//! What several hosts cost: figures to be printed, by `cargo test --release --features hosts --test all hosts::figures -- --ignored --nocapture`.
+//! Prints latencies of runs over several hosts: `cargo test --release --features hosts --test all hosts::figures -- --ignored --nocapture`.
 
 use super::sites::{APART_S, Site, apart, sites};
 use super::{KEYS, Run, TWO, UNJUDGED, finish};
@@ -6,20 +6,20 @@ use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 use zenoh::Wait;
 
-/// Round trips of each floor.
+/// Number of round trips of each baseline.
 const ROUNDS: usize = 2000;
-/// The length of what goes round, bytes: as a message with a measurement of `rigid-pair`.
+/// Length of a message, bytes: that of one with a measurement of `rigid-pair`.
 const BYTES: usize = 108;
-/// Between two, as at 200 Hz.
+/// Pause between round trips: the period at 200 Hz.
 const PAUSE: Duration = Duration::from_millis(5);
 
-/// Half of round trips, µs, as p50 and p99.
-fn halves(mut round: impl FnMut()) -> (f64, f64) {
+/// Returns p50 and p99 of half the round trip, µs.
+fn half_round_trips(mut round_trip: impl FnMut()) -> (f64, f64) {
     let mut halves: Vec<f64> = (0..ROUNDS)
         .map(|_| {
             std::thread::sleep(PAUSE);
             let sent = Instant::now();
-            round();
+            round_trip();
             sent.elapsed().as_secs_f64() * 5e5
         })
         .collect();
@@ -27,7 +27,7 @@ fn halves(mut round: impl FnMut()) -> (f64, f64) {
     (halves[ROUNDS / 2], halves[ROUNDS * 99 / 100])
 }
 
-/// A thread in a site's network, until what it does is done.
+/// Runs `act` in a site's network.
 fn at<T: Send>(site: &Site, act: impl FnOnce() -> T + Send) -> T {
     std::thread::scope(|scope| {
         let there = scope.spawn(|| {
@@ -46,29 +46,29 @@ fn udp(sites: &[Site]) -> (f64, f64) {
     std::thread::spawn(move || {
         let mut bytes = [0; BYTES];
         while let Ok((length, from)) = near.recv_from(&mut bytes) {
-            // An empty one ends it.
+            // An empty datagram ends the thread.
             if length == 0 || near.send_to(&bytes[..length], from).is_err() {
                 break;
             }
         }
     });
     let mut bytes = [0; BYTES];
-    let figures = halves(|| {
+    let latencies = half_round_trips(|| {
         far.send(&bytes).unwrap();
         far.recv(&mut bytes).unwrap();
     });
     far.send(&[]).unwrap();
-    figures
+    latencies
 }
 
 fn session(mode: &str, side: &str, address: &str) -> zenoh::Session {
     let mut config = zenoh::Config::default();
     let endpoints = format!("[\"{address}\"]");
-    let none = if side == "listen" { "connect" } else { "listen" };
+    let unused = if side == "listen" { "connect" } else { "listen" };
     for (key, value) in [
         ("mode", format!("\"{mode}\"").as_str()),
         (&format!("{side}/endpoints"), &endpoints),
-        (&format!("{none}/endpoints"), "[]"),
+        (&format!("{unused}/endpoints"), "[]"),
         ("scouting/multicast/enabled", "false"),
     ] {
         config.insert_json5(key, value).unwrap();
@@ -76,7 +76,7 @@ fn session(mode: &str, side: &str, address: &str) -> zenoh::Session {
     zenoh::open(config).wait().unwrap()
 }
 
-/// A bare put and its answer: publisher and subscriber as the engine's own example has them, taken from the subscriber's queue.
+/// Measures zenoh without corotate: publishers and subscribers as in zenoh's own ping example, with the subscribers' queues.
 fn zenoh_put(sites: &[Site]) -> (f64, f64) {
     let near = at(&sites[0], || session("router", "listen", "tcp/0.0.0.0:7900"));
     let far = at(&sites[1], || session("client", "connect", &format!("tcp/{}:7900", sites[1].hub())));
@@ -90,35 +90,35 @@ fn zenoh_put(sites: &[Site]) -> (f64, f64) {
             }
         }
     });
-    let heard = far.declare_subscriber("pong").wait().unwrap();
+    let replies = far.declare_subscriber("pong").wait().unwrap();
     std::thread::sleep(Duration::from_secs(1));
-    halves(|| {
+    half_round_trips(|| {
         ping.put(vec![0_u8; BYTES]).wait().unwrap();
-        heard.recv().unwrap();
+        replies.recv().unwrap();
     })
 }
 
 #[test]
-#[ignore = "it measures, for a minute"]
-fn figures() {
-    let floors = sites(2);
-    let (udp, put) = (udp(&floors), zenoh_put(&floors));
+#[ignore = "measures for a minute"]
+fn latencies_between_hosts() {
+    let baseline = sites(2);
+    let (udp, put) = (udp(&baseline), zenoh_put(&baseline));
     println!(
         "one way, us: bare UDP p50 {:.0}, p99 {:.0}; bare zenoh put p50 {:.0}, p99 {:.0}",
         udp.0, udp.1, put.0, put.1
     );
     let run = Run::new(&TWO, KEYS, "");
-    let launched = run.launch("tcp", &[&["--tick-hz", "200", "--duration", "30"][..], &UNJUDGED].concat());
+    let hub = run.launch("tcp", &[&["--tick-hz", "200", "--duration", "30"][..], &UNJUDGED].concat());
     let joined = run.join(1, "tcp", None);
-    let (_, over) = finish(launched, joined);
+    let (_, over) = finish(hub, joined);
     for link in over["hosts"]["links"].as_array().unwrap().iter().filter(|link| link["lossless"] == false) {
-        let of = |key: &str| link["one_way"][key].as_f64().unwrap();
+        let us = |key: &str| link["one_way"][key].as_f64().unwrap();
         let (service, from, to) = (&link["service"], &link["from"], &link["to"]);
         println!(
             "{service} {from} to {to}: one way, us: p50 {:.0}, p99 {:.0}, max {:.0}",
-            of("p50_us"),
-            of("p99_us"),
-            of("max_us")
+            us("p50_us"),
+            us("p99_us"),
+            us("max_us")
         );
     }
     let missed = &over["books"]["missed_ticks"];
@@ -128,11 +128,11 @@ fn figures() {
     );
     let clock = &over["hosts"]["hosts"][1]["clock"];
     let truth_ns = if apart() { -APART_S * 1_000_000_000 } else { 0 };
-    let wrong_us = (clock["offset_ns"].as_i64().unwrap() - truth_ns).abs() as f64 / 1e3;
+    let error_us = (clock["offset_ns"].as_i64().unwrap() - truth_ns).abs() as f64 / 1e3;
     let track = clock["track"].as_array().unwrap();
     let later_us = track.iter().map(|line| line[1].as_f64().unwrap().abs());
     println!(
-        "clock: wrong by {wrong_us:.1} us at the start, moved by {:.1} us at most since; known to {} us, at most {} us",
+        "clock: error {error_us:.1} us at the start, moved by at most {:.1} us since; bound {} us, at most {} us",
         later_us.fold(0.0, f64::max),
         clock["error_us"],
         clock["error_max_us"]

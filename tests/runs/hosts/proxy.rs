@@ -1,4 +1,4 @@
-//! A way that is worse than any cable: datagrams are delayed, lost, doubled, turned round, or cut off altogether.
+//! A proxy that impairs a UDP connection: it delays, loses, doubles and reorders datagrams, or drops all of them.
 
 use super::sites::Site;
 use std::cmp::Reverse;
@@ -9,53 +9,61 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// What the way does. Parts are of a thousand.
+/// Impairments of a connection; shares are in parts per thousand.
 #[derive(Clone, Copy, Default)]
 pub struct Impairment {
     pub delay_us: u64,
-    /// At most so much more, evenly.
+    /// Upper bound of an additional, uniformly distributed delay.
     pub jitter_us: u64,
+    /// Share of lost datagrams.
     pub lost: u64,
+    /// Share of doubled datagrams.
     pub doubled: u64,
-    /// Held back by [`LATE`] more, so that others overtake it.
+    /// Share of datagrams delayed by a further [`LATE`], so that later ones overtake them.
     pub late: u64,
 }
 
 const LATE: Duration = Duration::from_millis(3);
 
-/// A proxy in front of a port of the first site, in the network of another.
+/// A proxy in the network of one site, before a port of the first site.
 pub struct Proxy {
     pub port: u16,
     stop: Arc<AtomicBool>,
     cut: Arc<AtomicBool>,
-    /// Datagrams that it lost, doubled and held back.
-    pub ill: Arc<[AtomicU64; 3]>,
+    /// Number of lost, doubled and late datagrams.
+    pub impaired: Arc<[AtomicU64; 3]>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Proxy {
-    /// Starts one at a site that passes on to an address, the same for each seed.
+    /// Starts a proxy at a site that forwards to `to`. Equal seeds give equal impairments.
     pub fn start(site: &Site, to: SocketAddr, impairment: Impairment, seed: u64) -> Self {
         let (stop, cut) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
-        let ill: Arc<[AtomicU64; 3]> = Arc::default();
-        let (told, port) = std::sync::mpsc::channel();
-        let way =
-            Way { impairment, random: seed, cut: cut.clone(), ill: ill.clone(), queue: BinaryHeap::new(), number: 0 };
+        let impaired: Arc<[AtomicU64; 3]> = Arc::default();
+        let (port_sender, port) = std::sync::mpsc::channel();
+        let connection = Connection {
+            impairment,
+            random: seed,
+            cut: cut.clone(),
+            impaired: impaired.clone(),
+            queue: BinaryHeap::new(),
+            number: 0,
+        };
         let thread = std::thread::scope(|scope| {
-            // A thread that has gone into another network stays there.
+            // A thread that has entered another network namespace stays there, so a helper thread enters it.
             let stop = stop.clone();
             let started = scope.spawn(move || {
                 site.enter();
                 let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
-                told.send(socket.local_addr().unwrap().port()).unwrap();
-                std::thread::spawn(move || carry(&socket, to, way, &stop))
+                port_sender.send(socket.local_addr().unwrap().port()).unwrap();
+                std::thread::spawn(move || forward(&socket, to, connection, &stop))
             });
             started.join().unwrap()
         });
-        Self { port: port.recv().unwrap(), stop, cut, ill, thread: Some(thread) }
+        Self { port: port.recv().unwrap(), stop, cut, impaired, thread: Some(thread) }
     }
 
-    /// Cuts the way off, or joins it again.
+    /// Interrupts the connection, or restores it.
     pub fn cut(&self, cut: bool) {
         self.cut.store(cut, Ordering::SeqCst);
     }
@@ -68,20 +76,20 @@ impl Drop for Proxy {
     }
 }
 
-/// Datagrams on their way: when they are due, where to, by the order in which they came.
+/// Datagrams in flight: due time, number by arrival, client to which it returns (`None` towards the server), peer, bytes.
 type Queue = BinaryHeap<Reverse<(Instant, u64, Option<SocketAddr>, SocketAddr, Vec<u8>)>>;
 
-struct Way {
+struct Connection {
     impairment: Impairment,
     random: u64,
     cut: Arc<AtomicBool>,
-    ill: Arc<[AtomicU64; 3]>,
+    impaired: Arc<[AtomicU64; 3]>,
     queue: Queue,
     number: u64,
 }
 
-impl Way {
-    /// The next number of xorshift64*, below a bound.
+impl Connection {
+    /// Returns the next number of xorshift64*, below a bound.
     fn random(&mut self, below: u64) -> u64 {
         self.random ^= self.random >> 12;
         self.random ^= self.random << 25;
@@ -90,10 +98,10 @@ impl Way {
     }
 
     fn count(&self, kind: usize) {
-        self.ill[kind].fetch_add(1, Ordering::Relaxed);
+        self.impaired[kind].fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Takes a datagram in; `from` is the client that it comes from, or goes to.
+    /// Takes a datagram. Towards the server, `back_to` is `None` and `from` the client; towards a client, `back_to` is that client.
     fn take(&mut self, back_to: Option<SocketAddr>, from: SocketAddr, bytes: &[u8]) {
         let Impairment { delay_us, jitter_us, lost, doubled, late } = self.impairment;
         if self.cut.load(Ordering::SeqCst) || self.random(1000) < lost {
@@ -116,27 +124,27 @@ impl Way {
     }
 }
 
-/// Carries between clients and one server: a socket of its own for every client, by which the server knows it.
-fn carry(socket: &UdpSocket, to: SocketAddr, mut way: Way, stop: &AtomicBool) {
+/// Forwards between clients and one server, with a socket per client, by which the server distinguishes them.
+fn forward(socket: &UdpSocket, to: SocketAddr, mut connection: Connection, stop: &AtomicBool) {
     socket.set_nonblocking(true).unwrap();
     let mut clients: BTreeMap<SocketAddr, UdpSocket> = BTreeMap::new();
     let mut buffer = vec![0; 1 << 16];
     while !stop.load(Ordering::SeqCst) {
         let mut busy = false;
         while let Ok((length, client)) = socket.recv_from(&mut buffer) {
-            way.take(None, client, &buffer[..length]);
+            connection.take(None, client, &buffer[..length]);
             busy = true;
         }
         for (client, upstream) in &clients {
             while let Ok(length) = upstream.recv(&mut buffer) {
-                way.take(Some(*client), to, &buffer[..length]);
+                connection.take(Some(*client), to, &buffer[..length]);
                 busy = true;
             }
         }
         let now = Instant::now();
-        while way.queue.peek().is_some_and(|Reverse((due, ..))| *due <= now) {
-            let Some(Reverse((_, _, back_to, from, bytes))) = way.queue.pop() else { break };
-            // What cannot be sent is lost.
+        while connection.queue.peek().is_some_and(|Reverse((due, ..))| *due <= now) {
+            let Some(Reverse((_, _, back_to, from, bytes))) = connection.queue.pop() else { break };
+            // A datagram that cannot be sent is lost.
             let _ = match back_to {
                 Some(client) => socket.send_to(&bytes, client),
                 None => clients.entry(from).or_insert_with(|| upstream(to)).send(&bytes),

@@ -1,20 +1,20 @@
-//! Computers of a test: where this user is root, each with a network and a monotonic clock of its own, joined by veth pairs to the first;
-//! elsewhere all on loopback, with one clock.
+//! Simulated computers. If this user is root, each has its own network and monotonic clock, and a veth pair to the first; otherwise all
+//! share loopback and the clock.
 
 use crate::common::{Bench, Running, skipped};
 use libc::SIGKILL;
 use std::fs::File;
 use std::process::{Child, Command, Stdio};
 
-/// By how much the clocks of two sites that stand beside each other differ, s.
+/// Difference between the clocks of neighbouring sites, s.
 pub const APART_S: i64 = 1000;
 
-/// A computer.
+/// A simulated computer.
 pub struct Site {
     pub bench: Bench,
-    /// The process that keeps the namespaces, if it has any, and the one in them.
+    /// The process that keeps the site's namespaces, and the process id inside them.
     holder: Option<(Child, u32)>,
-    /// Its place in the row.
+    /// Index of the site.
     number: usize,
 }
 
@@ -28,7 +28,7 @@ impl Site {
             let children = format!("/proc/{0}/task/{0}/children", child.id());
             let inner = crate::common::await_some(|| {
                 let pid: u32 = std::fs::read_to_string(&children).ok()?.split_whitespace().next()?.parse().ok()?;
-                // Until it has become what it is to be, it may not be there yet.
+                // Before it executes `sleep`, it may not be in the namespaces yet.
                 let name = std::fs::read_to_string(format!("/proc/{pid}/comm")).ok()?;
                 (name.trim() == "sleep").then_some(pid)
             });
@@ -41,7 +41,7 @@ impl Site {
         site
     }
 
-    /// A command there.
+    /// Returns a command that runs at the site.
     pub fn command(&self, program: &std::path::Path) -> Command {
         let Some((_, pid)) = &self.holder else { return self.bench.command_of(program) };
         let mut command = self.bench.command_of(std::path::Path::new("nsenter"));
@@ -49,7 +49,7 @@ impl Site {
         command
     }
 
-    /// Starts our program there.
+    /// Starts corotate at the site.
     pub fn start(&self, arguments: &[&str]) -> Running {
         Running::new(self.command(std::path::Path::new(env!("CARGO_BIN_EXE_corotate"))).args(arguments))
     }
@@ -59,7 +59,7 @@ impl Site {
         assert!(done.status.success(), "{words:?}: {}", String::from_utf8_lossy(&done.stderr));
     }
 
-    /// Takes the calling thread into its network, if it has one.
+    /// Moves the calling thread into the site's network, if it has its own.
     pub fn enter(&self) {
         if let Some((_, pid)) = &self.holder {
             let network = File::open(format!("/proc/{pid}/ns/net")).unwrap();
@@ -68,17 +68,17 @@ impl Site {
         }
     }
 
-    /// Takes its cable out, or puts it in again; only where it has one.
+    /// Sets its network interface `up` or `down`.
     pub fn plug(&self, state: &str) {
         self.system(&["ip", "link", "set", "eth0", state]);
     }
 
-    /// Where this site reaches the first one.
+    /// Returns the address of the first site, as seen from this one.
     pub fn hub(&self) -> String {
         if self.holder.is_some() { format!("10.77.{}.1", self.number) } else { "127.0.0.1".to_owned() }
     }
 
-    /// Kills every process there, as a power cut does.
+    /// Kills all processes of the site, like a power cut.
     pub fn cut_power(&self) {
         self.bench.processes().into_iter().for_each(|pid| crate::common::send_signal(pid, SIGKILL));
     }
@@ -93,18 +93,18 @@ impl Drop for Site {
     }
 }
 
-/// Whether sites have networks and clocks of their own here.
+/// Returns true if sites have their own networks and clocks here.
 pub fn apart() -> bool {
-    let tried =
+    let output =
         Command::new("unshare").args(["--net", "--time", "--monotonic", "1000", "--fork", "ip", "link"]).output();
-    let can = rustix::process::getuid().is_root() && tried.is_ok_and(|done| done.status.success());
+    let can = rustix::process::getuid().is_root() && output.is_ok_and(|done| done.status.success());
     if !can {
-        skipped("networks and clocks of their own", "this user may not make namespaces: all hosts are on loopback");
+        skipped("networks and clocks of their own", "this user may not create namespaces: all hosts are on loopback");
     }
     can
 }
 
-/// So many sites; every other one is joined to the first.
+/// Creates `count` sites, all connected to the first.
 pub fn sites(count: usize) -> Vec<Site> {
     let apart = apart();
     let sites: Vec<Site> = (0..count).map(|number| Site::new(number, apart)).collect();
@@ -121,7 +121,7 @@ pub fn sites(count: usize) -> Vec<Site> {
     sites
 }
 
-/// A port of the first site's that nobody has.
+/// Returns a free port of the first site.
 pub fn free_port() -> u16 {
     std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
 }

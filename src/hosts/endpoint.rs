@@ -1,55 +1,55 @@
-//! Where a host is reached, and what it takes to be let in. Must not open anything.
+//! Addresses of hosts, and the keys that they require. Must not open anything.
 
 use std::fmt;
 use std::net::IpAddr;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-/// The name of a run's relay where a role would have its own.
+/// Name of a run's relay, in places where roles have theirs.
 pub const RELAY: &str = "relay";
 
-/// What carries the messages between hosts.
+/// The protocol that carries messages between hosts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Carrier {
-    /// TCP, in the clear.
+    /// TCP, unencrypted.
     Tcp,
-    /// UDP, in the clear: what is lost is not sent again.
+    /// UDP, unencrypted: lost datagrams are not repeated.
     Udp,
-    /// QUIC, which is TLS 1.3 over UDP; both sides show who they are. The engine's TLS over TCP reads and writes one connection from two
-    /// threads without a lock (its issue 2557), and dies of it.
+    /// QUIC (TLS 1.3 over UDP); both sides show a certificate. There is no TLS over TCP, because zenoh reads and writes such a
+    /// connection from two threads without a lock (its issue 2557), and crashes.
     Quic,
 }
 
-/// Where a host listens: `tcp/HOST:PORT`, `udp/HOST:PORT` or `quic/HOST:PORT`.
+/// The address of a listening host: `tcp/HOST:PORT`, `udp/HOST:PORT` or `quic/HOST:PORT`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Address {
-    /// What carries the messages.
+    /// The protocol.
     pub carrier: Carrier,
     host: String,
     port: u16,
 }
 
-/// Why an address, or the way to use it, is refused.
+/// Reasons to refuse an address, or its combination with keys.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum AddressError {
-    /// It has not the form.
-    #[error("`{0}` is no address; write quic/HOST:PORT, tcp/HOST:PORT or udp/HOST:PORT")]
+    /// The address is malformed.
+    #[error("`{0}` is not an address; write quic/HOST:PORT, tcp/HOST:PORT or udp/HOST:PORT")]
     #[strum(serialize = "not-an-address")]
     Form(String),
-    /// Anybody could join.
+    /// Any host could join.
     #[error(
-        "{0} is open to everybody who reaches it; take quic/HOST:PORT with --tls-ca, --tls-cert and --tls-key, or say --insecure if \
-         only friends do"
+        "{0} accepts any host that can reach it; use quic/HOST:PORT with --tls-ca, --tls-cert and --tls-key, or add --insecure on a \
+         trusted network"
     )]
     #[strum(serialize = "open-address")]
     Open(Address),
     /// Keys are missing.
-    #[error("{0} needs --tls-ca, --tls-cert and --tls-key, all three; docs/hosts.md tells how to make them")]
+    #[error("{0} needs --tls-ca, --tls-cert and --tls-key; docs/hosts.md shows how to make keys")]
     #[strum(serialize = "missing-keys")]
     Keys(Address),
-    /// Keys are of no use.
-    #[error("{0} uses no keys; take quic/HOST:PORT, or leave --tls-ca, --tls-cert and --tls-key out")]
+    /// The protocol does not use keys.
+    #[error("{0} does not use keys; use quic/HOST:PORT, or leave out --tls-ca, --tls-cert and --tls-key")]
     #[strum(serialize = "unused-keys")]
     NoKeys(Address),
 }
@@ -78,7 +78,7 @@ impl FromStr for Address {
                 _ => return None,
             };
             let (host, port) = place.rsplit_once(':')?;
-            // What follows a `?` or `#` in an address of the engine's would configure it.
+            // In zenoh, the text after a `?` or `#` in an address configures the session.
             let plain = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'-' | b'_' | b':' | b'[' | b']');
             let whole = !host.is_empty() && host.bytes().all(plain);
             whole.then_some(Self { carrier, host: host.to_owned(), port: port.parse().ok()? })
@@ -88,37 +88,37 @@ impl FromStr for Address {
 }
 
 impl Address {
-    /// Whether only this machine reaches it.
+    /// Returns true if only this machine can reach the address.
     fn is_loopback(&self) -> bool {
         let bare = self.host.trim_matches(['[', ']']);
         bare == "localhost" || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
     }
 }
 
-/// The files by which a host shows who it is, and knows who others are.
+/// The files with which a host proves its identity and checks that of others.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Keys {
-    /// The certificate of the authority that has signed those of all hosts.
+    /// Certificate of the authority that has signed the certificates of all hosts.
     pub ca: PathBuf,
-    /// This host's certificate.
+    /// Certificate of this host.
     pub cert: PathBuf,
-    /// Its private key.
+    /// Private key of this host.
     pub key: PathBuf,
 }
 
-/// An address with all that it takes.
+/// An address with its keys.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Endpoint {
-    /// Where.
+    /// The address.
     pub address: Address,
-    /// The keys, with QUIC.
+    /// The keys, for QUIC.
     pub keys: Option<Keys>,
-    /// Whether it may be open to everybody who reaches it.
+    /// True if any host that can reach the address may join.
     pub insecure: bool,
 }
 
 impl Endpoint {
-    /// Refuses what would be open without having been said to be.
+    /// Checks that the address has keys, is a loopback address, or is insecure by request.
     ///
     /// # Errors
     /// [`AddressError`].
@@ -133,7 +133,7 @@ impl Endpoint {
         }
     }
 
-    /// The options that give another process of this program the same.
+    /// Returns the command-line options that give another process of this program the same endpoint.
     pub fn options(&self) -> Vec<std::ffi::OsString> {
         let mut options = vec!["--address".into(), self.address.to_string().into()];
         if let Some(Keys { ca, cert, key }) = &self.keys {
@@ -145,12 +145,12 @@ impl Endpoint {
     }
 }
 
-/// The part of one host in a run that another may have launched.
+/// A host of a run, with the address of the launching host.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct HostSeat {
-    /// The host's name in the scenario.
+pub struct HostEndpoint {
+    /// Name of the host in the scenario.
     pub host: String,
-    /// Where the host that launches listens.
+    /// Address and keys of the launching host.
     pub endpoint: Endpoint,
 }
 
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn an_address_is_what_it_says() {
+    fn an_address_prints_as_written_and_a_malformed_one_is_refused() {
         for text in ["tcp/127.0.0.1:7447", "quic/bench.example:1", "udp/[::1]:65535"] {
             assert_eq!(text.parse::<Address>().unwrap().to_string(), text);
         }
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_open_that_was_not_said_to_be() {
+    fn an_address_beyond_loopback_needs_keys_or_insecure() {
         for loopback in ["tcp/127.0.0.1:1", "udp/[::1]:1", "tcp/localhost:1"] {
             assert_eq!(endpoint(loopback, false, false).check(), Ok(()));
         }
