@@ -1,10 +1,10 @@
-"""A follower that shares no code with corotate: a rigid body with perfect gyros, in a seat of a run.
+"""A foreign follower that shares no code with corotate: a rigid body with perfect gyros.
 
-Everything it knows of the run comes from the seat's description, `<domain>/<role>.seat.json`. It keeps logical execution
-time: command k-1 acts from tick k on; what is late is never applied. It integrates Euler's equations itself, in steps of
-half the built-in body's. Must not need any other role to be alive, and must not outlive the run.
+It takes its role in a run from the seat file `<domain>/<role>.seat.json` alone. It keeps logical execution time: command k-1
+acts from tick k on, and a late command is never applied. It integrates Euler's equations in half the steps of the built-in
+body. Must not require that any other role is alive, and must not outlive the run.
 
-Exit codes: 0 the run ended in order, 1 it did not, 2 the seat is not one for this program.
+Exit codes: 0 the run ended in order, 1 it did not, 2 the seat does not suit this program.
 """
 
 import argparse
@@ -22,28 +22,29 @@ import time
 
 import iceoryx2 as iox2
 
-#: How far the body may turn in one integration step, rad.
+#: Largest rotation in one integration step, rad.
 MAX_STEP_RAD = 1e-3
-#: How often it looks for the launcher's word and says how it is, ns; between two looks before its ticks; and for a sample.
-TURN_NS = 20_000_000
-LOOK_S = 1e-3
-NAP_S = 50e-6
-#: Wakes so long before a tick and spins the rest, ns.
+#: Interval of heartbeats and of checks for the launcher's announcements, ns.
+STATUS_NS = 20_000_000
+#: Pauses before and after the ticks, and while a sample is missing, s.
+POLL_S = 1e-3
+SAMPLE_POLL_S = 50e-6
+#: Time before a tick at which it wakes; it spins until the tick, ns.
 WAKE_LEAD_NS = 150_000
-#: Ticks in lockstep between two words to the launcher.
-TURN_TICKS = 256
+#: Ticks between two heartbeats in lockstep.
+STATUS_TICKS = 256
 
 
 class SeatError(Exception):
-    """The seat is not one that this program can take."""
+    """This program cannot take the seat."""
 
 
 class RunLost(Exception):
-    """The run is gone without a word."""
+    """The run is gone without an announcement."""
 
 
 def structure(described):
-    """The ctypes structure of a signal's samples, laid out and named as described."""
+    """Returns the ctypes structure of a signal's samples, as the seat describes it."""
     kinds = {"u64": ctypes.c_uint64, "f64": ctypes.c_double}
     fields = described["fields"]
     types = [kinds[field["kind"]] * field["count"] if field["count"] > 1 else kinds[field["kind"]] for field in fields]
@@ -52,9 +53,9 @@ def structure(described):
         "type_name": staticmethod(lambda: described["type_name"]),
     }
     sample = type(described["signal"].capitalize(), (ctypes.Structure,), members)
-    laid_out = all(getattr(sample, field["name"]).offset == field["offset"] for field in fields)
-    if not laid_out or ctypes.sizeof(sample) != described["size"]:
-        raise SeatError(f"{described['service']}: this machine lays {described['type_name']} out differently")
+    fits = all(getattr(sample, field["name"]).offset == field["offset"] for field in fields)
+    if not fits or ctypes.sizeof(sample) != described["size"]:
+        raise SeatError(f"{described['service']}: the layout of {described['type_name']} differs on this machine")
     return sample
 
 
@@ -64,9 +65,9 @@ class Transport:
     def __init__(self, described, name):
         version = importlib.metadata.version("iceoryx2")
         if version != described["version"]:
-            raise SeatError(f"iceoryx2 {version} is installed and the run has {described['version']}; install that")
+            raise SeatError(f"iceoryx2 {version} is installed; install {described['version']}, which the run uses")
         if described["prefix"] is None:
-            raise SeatError("the seat names no domain; take the file that `corotate run --external` writes")
+            raise SeatError("the seat has no domain; use the file that `corotate run --external` writes")
         iox2.set_log_level(iox2.LogLevel.Fatal)
         configuration = iox2.config.default()
         configuration.global_cfg.root_path = iox2.Path.new(described["root_path"])
@@ -75,7 +76,7 @@ class Transport:
         self.node = builder.signal_handling_mode(iox2.SignalHandlingMode.Disabled).create(iox2.ServiceType.Ipc)
 
     def service(self, described, sample):
-        """Opens a service, or makes it as every other role would."""
+        """Opens a service, or creates it with the settings that all roles use."""
         builder = self.node.service_builder(iox2.ServiceName.new(described["service"])).publish_subscribe(sample)
         for option, value in described["qos"].items():
             builder = getattr(builder, option)(value)
@@ -83,7 +84,7 @@ class Transport:
 
 
 class Writer:
-    """The writing end of a signal, with its books."""
+    """The writing end of a signal, with its counters."""
 
     def __init__(self, transport, described):
         self.service = described["service"]
@@ -91,14 +92,14 @@ class Writer:
         factory = transport.service(described, type(self.sample)).publisher_builder()
         self.publisher = factory.backpressure_strategy(iox2.BackpressureStrategy.DiscardData).create()
         self.published, self.skipped, self.last_tick = 0, 0, None
-        #: Every sample, byte for byte, where somebody asks for it.
+        #: The bytes of all samples, with --record.
         self.record = None
 
     def warm_up(self):
         self.publisher.send_copy(type(self.sample)())
 
     def send(self):
-        """Sends the sample as it is filled, under its stamp's tick."""
+        """Sends the current sample."""
         self.publisher.send_copy(self.sample)
         self.published += 1
         self.skipped += self.sample.tick - (0 if self.last_tick is None else self.last_tick + 1)
@@ -106,17 +107,17 @@ class Writer:
         if self.record is not None:
             self.record += bytes(self.sample)
 
-    def books(self):
+    def counters(self):
         keys = ("service", "published", "skipped", "last_tick")
         return {key: getattr(self, key) for key in keys}
 
 
 class Reader:
-    """The reading end of a signal, with its books."""
+    """The reading end of a signal, with its counters."""
 
     def __init__(self, transport, described, void_bit):
         self.service = described["service"]
-        #: In a generation: of this tick there is no sample.
+        #: Bit in a generation that marks a tick without a sample.
         self.void_mark = 1 << void_bit
         self.type = structure(described)
         factory = transport.service(described, self.type).subscriber_builder()
@@ -124,11 +125,11 @@ class Reader:
         self.sample = None
         self.received, self.gaps, self.stale, self.void = 0, 0, 0, 0
         self.last_tick, self.last_generation = None, None
-        #: Every sample, byte for byte, where somebody asks for it.
+        #: The bytes of all samples, with --record.
         self.record = None
 
     def receive(self):
-        """The next sample as it comes, or none."""
+        """Returns the next sample in order of arrival, or None."""
         sample = self.subscriber.receive()
         if sample is None:
             return None
@@ -137,27 +138,27 @@ class Reader:
         return copy
 
     def newest(self):
-        """The last word of a signal of which only that counts."""
+        """Returns the newest sample of a signal whose older samples do not matter."""
         while (sample := self.receive()) is not None:
             self.sample = sample
         return self.sample
 
     def seek(self, tick):
-        """Moves on to the sample of a tick: True if it is at hand, False if it never will be, None if it may still come."""
+        """Moves to the sample of a tick. Returns True if it has arrived, False if it is missing, None if it may still arrive."""
         while self.last_tick is None or self.last_tick < tick:
             sample = self.receive()
             if sample is None:
                 return None
-            real = sample.generation != 0 and self.account(sample)
-            self.sample = sample if real and not sample.generation & self.void_mark else None
+            newer = sample.generation != 0 and self.account(sample)
+            self.sample = sample if newer and not sample.generation & self.void_mark else None
         return self.last_tick == tick and self.sample is not None
 
     def account(self, sample):
-        """Enters a sample into the books; False if it is not newer than the one before."""
+        """Counts a sample. Returns False if it is not newer than the previous one."""
         expected = 0
         if self.last_tick is not None:
-            known = sample.generation & ~self.void_mark == self.last_generation
-            expected = self.last_tick + 1 if known else sample.tick
+            same_writer = sample.generation & ~self.void_mark == self.last_generation
+            expected = self.last_tick + 1 if same_writer else sample.tick
         if sample.tick < expected:
             self.stale += 1
             return False
@@ -171,13 +172,13 @@ class Reader:
             self.record += bytes(sample)
         return True
 
-    def books(self):
+    def counters(self):
         keys = ("service", "received", "gaps", "stale", "void", "last_tick")
         return {key: getattr(self, key) for key in keys}
 
 
 class Body:
-    """A rigid body under a held acceleration: Euler's equations in principal axes."""
+    """A rigid body under a constant acceleration: Euler's equations in principal axes."""
 
     RIG = "rigid-body"
 
@@ -187,29 +188,29 @@ class Body:
         i1, i2, i3 = (moment * factor for moment, factor in zip(scenario["leader"]["inertia_kg_m2"], self.factor))
         self.coefficients = ((i2 - i3) / i1, (i3 - i1) / i2, (i1 - i2) / i3)
         self.rate = tuple(own["initial_rate_rad_s"])
-        #: What the last command asked for, rad/s²: torque over the nominal inertia.
-        self.asked = (0.0, 0.0, 0.0)
+        #: The last command, rad/s²: torque over the nominal inertia.
+        self.commanded = (0.0, 0.0, 0.0)
 
-    def believes(self, command):
+    def accepts(self, command):
         return all(map(math.isfinite, command.acceleration_rad_s2))
 
     def apply(self, command):
-        self.asked = tuple(command.acceleration_rad_s2)
+        self.commanded = tuple(command.acceleration_rad_s2)
 
     def apply_safe(self):
-        self.asked = (0.0, 0.0, 0.0)
+        self.commanded = (0.0, 0.0, 0.0)
 
     def measured(self):
-        return {"omega_rad_s": self.rate, "applied_rad_s2": self.asked, "valid": 0b111}
+        return {"omega_rad_s": self.rate, "applied_rad_s2": self.commanded, "valid": 0b111}
 
     def truth(self):
         return {"omega_rad_s": self.rate, "applied_rad_s2": self.acceleration()}
 
     def acceleration(self):
-        return tuple(asked / factor for asked, factor in zip(self.asked, self.factor))
+        return tuple(commanded / factor for commanded, factor in zip(self.commanded, self.factor))
 
     def flow(self, dt_s):
-        """Moves the body by `dt_s` seconds: classical Runge-Kutta of fourth order in equal steps."""
+        """Integrates over `dt_s` seconds with the classical Runge-Kutta method in equal steps."""
         acceleration = self.acceleration()
         fastest = max(map(abs, self.rate)) + dt_s * max(map(abs, acceleration))
         steps = max(1, math.ceil(dt_s * fastest / MAX_STEP_RAD))
@@ -222,74 +223,74 @@ class Body:
         return a1 * y * z + u1, a2 * z * x + u2, a3 * x * y + u3
 
     def step(self, x, u, h):
-        def ahead(slope, part):
-            return tuple(value + part * rise for value, rise in zip(x, slope))
+        def advance(slope, duration):
+            return tuple(value + duration * rise for value, rise in zip(x, slope))
 
         k1 = self.derivative(x, u)
-        k2 = self.derivative(ahead(k1, h / 2), u)
-        k3 = self.derivative(ahead(k2, h / 2), u)
-        k4 = self.derivative(ahead(k3, h), u)
+        k2 = self.derivative(advance(k1, h / 2), u)
+        k3 = self.derivative(advance(k2, h / 2), u)
+        k4 = self.derivative(advance(k3, h), u)
         return tuple(x + h / 6 * (a + 2 * b + 2 * c + d) for x, a, b, c, d in zip(x, k1, k2, k3, k4))
 
 
 class Actuator:
-    """What a body owes its commands: apply in time, hold, go safe after the timeout, re-arm."""
+    """Applies commands: holds the last one, goes safe after the timeout, re-arms."""
 
     def __init__(self, body, seat):
         self.body = body
         self.timeout_ticks = seat["command_timeout_ticks"]
         self.latches = seat["rearm"] == "manual"
         self.status_bits = seat["status"]
-        self.silent_ticks = 0
+        self.missing_ticks = 0
         self.safe, self.rejected = False, False
 
     def take(self, command):
-        """Decides the input of a tick: its command, or none. True if one was due and did not come, or is not believed."""
-        self.rejected = command is not None and not self.body.believes(command)
+        """Applies the command of a tick, or None. Returns True if it is missing or rejected."""
+        self.rejected = command is not None and not self.body.accepts(command)
         if command is None or self.rejected:
-            self.silent_ticks += 1
-            if not self.safe and self.silent_ticks >= self.timeout_ticks:
+            self.missing_ticks += 1
+            if not self.safe and self.missing_ticks >= self.timeout_ticks:
                 self.safe = True
                 self.body.apply_safe()
             return True
         if not (self.safe and self.latches):
             self.body.apply(command)
-            self.silent_ticks, self.safe = 0, False
+            self.missing_ticks, self.safe = 0, False
         return False
 
     def status(self):
         bits = self.status_bits["rejected"] if self.rejected else 0
         if self.safe:
             return bits | self.status_bits["safe"]
-        return bits | (self.status_bits["holding"] if self.silent_ticks > 0 else 0)
+        return bits | (self.status_bits["holding"] if self.missing_ticks > 0 else 0)
 
 
 class Follower:
-    """The role: its links, its ticks, its books."""
+    """The role with its links, ticks and counters."""
 
     def __init__(self, path, terminated, silent, body):
         with open(path, encoding="utf-8") as file:
             self.seat = seat = json.load(file)
         self.path, self.terminated, self.silent = path, terminated, silent
         if seat["schema"] != "corotate/seat/v1" or seat["kind"] != "plant" or not seat["reads"]:
-            raise SeatError(f"{seat['role']} is no driven body described by corotate/seat/v1")
+            raise SeatError(f"{seat['role']} is not a driven body described by corotate/seat/v1")
         if seat["scenario"]["rig"] != body.RIG:
-            raise SeatError(f"this program is of the rig {body.RIG}, and the run's is {seat['scenario']['rig']}")
+            raise SeatError(f"this program supports the rig {body.RIG}, not {seat['scenario']['rig']}")
         self.transport = Transport(seat["transport"], seat["role"])
         try:
             self.open_links()
-        except Exception as error:  # iceoryx2's errors have no ancestor of their own
-            raise SeatError(f"cannot open the links of {seat['role']}: {error!r}; is the seat taken?") from error
+        except Exception as error:  # iceoryx2's errors have no common base class
+            raise SeatError(f"cannot open the links of {seat['role']}: {error!r}; check that no other program has the role") from error
         self.body = body(seat["scenario"], seat["role"])
         self.actuator = Actuator(self.body, seat)
         self.period_ns, self.last_tick = seat["period_ns"], seat["last_tick"]
         self.timed = seat["clock"] == "realtime"
-        self.epoch_ns, self.next_tick, self.next_turn_ns = 0, 0, 0
+        self.epoch_ns, self.next_tick, self.next_status_ns = 0, 0, 0
         self.ticks = {"executed": 0, "missed": 0, "starved": 0, "safe": 0, "first_disturbed": None}
         self.grants = []
 
     def open_links(self):
-        # Before the signals of the loop: whoever has those open and not this one is judged by its samples alone.
+        # Before the signals of the loop: the launcher judges a role without heartbeats by its samples alone.
         self.health = None if self.silent else Writer(self.transport, self.seat["health"])
         self.measurement, self.truth = (Writer(self.transport, described) for described in self.seat["writes"])
         void_bit = self.seat["void_bit"]
@@ -297,26 +298,26 @@ class Follower:
         self.schedule = Reader(self.transport, self.seat["schedule"], void_bit)
 
     def run(self):
-        """From open links to the end of the run."""
+        """Runs the role until the run ends."""
         if self.await_phase("open", "warm_up") and self.warm_up() and self.await_phase("ready", "run"):
             self.epoch_ns = self.schedule.newest().epoch_ns
             self.realtime() if self.timed else self.lockstep()
         if not self.silent:
             self.report()
-        # Samples may still wait to be read: the links stay open until everybody is done.
+        # The links stay open until the run stops, because other roles may still read samples.
         while self.next_tick > self.last_tick and not self.stopped():
             self.announce("done")
             self.refresh()
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
 
     def await_phase(self, state, phase):
-        """Announces a state until the launcher says a phase; False if the run was stopped before."""
+        """Publishes a state until the launcher announces a phase. Returns False if the run stops first."""
         while not self.stopped():
             self.announce(state)
-            word = self.schedule.newest()
-            if word is not None and word.phase >= self.seat["phases"][phase]:
+            schedule = self.schedule.newest()
+            if schedule is not None and schedule.phase >= self.seat["phases"][phase]:
                 return True
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
         return False
 
     def warm_up(self):
@@ -329,8 +330,8 @@ class Follower:
         return True
 
     def realtime(self):
-        """Ticks on the absolute grid; what is late is skipped, never made up for in a burst."""
-        self.ask_for_priority()
+        """Executes ticks on the absolute grid; skips late ones instead of executing them in a burst."""
+        self.request_priority()
         while self.next_tick <= self.last_tick:
             if not self.idle_until(self.epoch_ns + self.next_tick * self.period_ns):
                 return
@@ -338,34 +339,34 @@ class Follower:
             self.skip_to(min(due, self.last_tick + 1))
             if self.next_tick <= self.last_tick:
                 self.tick()
-            if self.turn():
+            if self.publish_status():
                 return
 
     def idle_until(self, due_ns):
-        """Sleeps, then spins, until an instant; False if the run was stopped meanwhile."""
+        """Sleeps, then spins, until a time. Returns False if the run stops first."""
         while (left_ns := due_ns - time.monotonic_ns()) > 0:
             if left_ns > WAKE_LEAD_NS:
-                time.sleep(min(left_ns - WAKE_LEAD_NS, TURN_NS) / 1e9)
-                if left_ns > TURN_NS and self.turn():
+                time.sleep(min(left_ns - WAKE_LEAD_NS, STATUS_NS) / 1e9)
+                if left_ns > STATUS_NS and self.publish_status():
                     return False
         return True
 
-    def turn(self):
-        """Now and then: how this role is, and whether the run is over."""
-        if time.monotonic_ns() < self.next_turn_ns:
+    def publish_status(self):
+        """Publishes a heartbeat when it is due. Returns True if the run is over."""
+        if time.monotonic_ns() < self.next_status_ns:
             return False
-        self.next_turn_ns = time.monotonic_ns() + TURN_NS
+        self.next_status_ns = time.monotonic_ns() + STATUS_NS
         self.announce("running")
         self.refresh()
         return self.stopped()
 
     def refresh(self):
-        """Lets roles that were started anew have what they still lack: in lockstep the loop waits for them."""
+        """Delivers retained samples to restarted roles, for which the loop waits in lockstep."""
         for writer in (self.measurement, self.truth):
             writer.publisher.update_connections()
 
     def lockstep(self):
-        """Ticks by the inputs alone, at most the window ahead of the slowest consumer."""
+        """Executes each tick once its command has arrived, at most the window ahead of the slowest reader."""
         idle = 0
         while self.next_tick <= self.last_tick:
             credit = self.schedule.newest().credit_tick + self.seat["window_ticks"]
@@ -373,23 +374,23 @@ class Follower:
             if ready and self.next_tick <= credit:
                 idle = 0
                 self.tick()
-                if self.next_tick % TURN_TICKS == 0:
+                if self.next_tick % STATUS_TICKS == 0:
                     self.announce("running")
                 continue
             idle += 1
             if idle > 50:
-                time.sleep(NAP_S)
-            if self.turn():
+                time.sleep(SAMPLE_POLL_S)
+            if self.publish_status():
                 return
 
     def tick(self):
-        """One tick: the command in, measurement and truth out, and then the body moves on."""
+        """Executes a tick: applies the command, publishes measurement and truth, integrates."""
         tick = self.next_tick
         if tick > 0:
             in_time = self.command.seek(tick - 1)
             if self.actuator.take(self.command.sample if in_time else None):
                 self.ticks["starved"] += 1
-                self.disturbed(tick)
+                self.note_disturbed(tick)
         self.ticks["safe"] += self.actuator.safe
         self.publish(self.measurement, self.body.measured())
         self.publish(self.truth, self.body.truth())
@@ -408,19 +409,19 @@ class Follower:
         writer.send()
 
     def skip_to(self, tick):
-        """Counts the ticks before `tick` as missed; the body moves through them all the same."""
+        """Counts the ticks before `tick` as missed, and integrates over them."""
         for _ in range(self.next_tick, tick):
-            self.disturbed(self.next_tick)
+            self.note_disturbed(self.next_tick)
             self.ticks["missed"] += 1
             self.next_tick += 1
             self.body.flow(self.period_ns / 1e9)
 
-    def disturbed(self, tick):
+    def note_disturbed(self, tick):
         if self.ticks["first_disturbed"] is None:
             self.ticks["first_disturbed"] = tick
 
     def announce(self, state):
-        """Tells the launcher how this role is, if it does so at all."""
+        """Publishes a heartbeat, unless --silent."""
         if self.silent:
             return
         sample = self.health.sample
@@ -432,18 +433,18 @@ class Follower:
         self.health.publisher.send_copy(sample)
 
     def stopped(self):
-        """Whether the run is over for this role. The launcher says so before it removes the domain."""
-        # Not the domain's directory: the transport makes that anew for whoever comes too late.
+        """Returns True if the run is over. The launcher announces that before it removes the domain."""
+        # Not the domain's directory, because the transport creates it again for a late program.
         gone = not os.path.exists(self.path)
-        word = self.schedule.newest()
-        if self.terminated or (word is not None and word.phase >= self.seat["phases"]["stop"]):
+        schedule = self.schedule.newest()
+        if self.terminated or (schedule is not None and schedule.phase >= self.seat["phases"]["stop"]):
             return True
         if gone:
             raise RunLost(f"{self.path} is gone: the run is over")
         return False
 
-    def ask_for_priority(self):
-        """Runs before all ordinary processes where that is granted; what is not is reported, and done without."""
+    def request_priority(self):
+        """Requests real-time priority, and reports whether it was granted."""
         asked = self.seat["scenario"]["realtime"]["priority"] - 1
         if asked <= 0:
             return
@@ -456,37 +457,37 @@ class Follower:
         self.grants.append(grant)
 
     def report(self):
-        """Leaves the books, whole, where the launcher looks for them."""
-        books = {
+        """Writes the report for the launcher in one step."""
+        report = {
             "role": self.seat["role"],
             "ticks": {"elapsed": self.next_tick, **self.ticks},
-            "written": [self.measurement.books(), self.truth.books()],
-            "read": [self.command.books()],
+            "written": [self.measurement.counters(), self.truth.counters()],
+            "read": [self.command.counters()],
             "grants": self.grants,
         }
-        part = self.seat["report"] + ".part"
-        with open(part, "w", encoding="utf-8") as file:
-            json.dump(books, file)
-        os.replace(part, self.seat["report"])
+        partial = self.seat["report"] + ".part"
+        with open(partial, "w", encoding="utf-8") as file:
+            json.dump(report, file)
+        os.replace(partial, self.seat["report"])
 
-    def loop_ends(self):
+    def loop_links(self):
         return {"measurement": self.measurement, "truth": self.truth, "command": self.command}
 
     def record(self):
-        """Keeps every sample that is published or received from now on."""
-        for end in self.loop_ends().values():
-            end.record = bytearray()
+        """Keeps all samples that are published or received from now on."""
+        for link in self.loop_links().values():
+            link.record = bytearray()
 
-    def leave_record(self, directory):
-        """Leaves what was kept, one file per signal."""
+    def write_record(self, directory):
+        """Writes the kept samples, one file per signal."""
         os.makedirs(directory, exist_ok=True)
-        for name, end in self.loop_ends().items():
+        for name, link in self.loop_links().items():
             with open(os.path.join(directory, f"{name}.bin"), "wb") as file:
-                file.write(end.record)
+                file.write(link.record)
 
 
-def forget(transport):
-    """Removes what the transport made anew in a domain that was gone when this program came."""
+def remove_files(transport):
+    """Removes the files that the transport created in a domain that no longer existed."""
     domain = transport["domain"]
     if os.path.exists(domain + ".lock"):
         return
@@ -496,14 +497,14 @@ def forget(transport):
     try:
         os.rmdir(os.path.dirname(domain))
     except OSError:
-        pass  # Other runs live there.
+        pass  # Other runs use it.
 
 
 def main(body=Body):
-    parser = argparse.ArgumentParser(description="A follower in a seat of a corotate run.")
-    parser.add_argument("seat", help="the seat's description, as the waiting run prints its path")
-    parser.add_argument("--record", metavar="DIR", help="leave every sample published and received there")
-    parser.add_argument("--silent", action="store_true", help="say nothing of itself, as hardware may: samples only")
+    parser = argparse.ArgumentParser(description="Take the role of a follower in a corotate run.")
+    parser.add_argument("seat", help="the seat file whose path the waiting run prints")
+    parser.add_argument("--record", metavar="DIR", help="write all samples published and received to DIR")
+    parser.add_argument("--silent", action="store_true", help="send samples only, no heartbeats and no report")
     arguments = parser.parse_args()
     terminated = []
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -512,14 +513,14 @@ def main(body=Body):
         follower = Follower(arguments.seat, terminated, arguments.silent, body)
         if arguments.record:
             follower.record()
-        # What is made from now on is freed by reference counts; a collection would cost ticks.
+        # Reference counts free the objects of the loop; a garbage collection would miss ticks.
         gc.freeze()
         gc.disable()
         follower.run()
         if arguments.record:
-            follower.leave_record(arguments.record)
+            follower.write_record(arguments.record)
     except KeyError as error:
-        print(f"follower: {arguments.seat} is no seat: it lacks {error}", file=sys.stderr)
+        print(f"follower: {arguments.seat} is not a seat file: {error} is missing", file=sys.stderr)
         return 2
     except (SeatError, OSError, ValueError) as error:
         print(f"follower: {arguments.seat}: {error}", file=sys.stderr)
@@ -528,7 +529,7 @@ def main(body=Body):
         print(f"follower: {error}", file=sys.stderr)
         transport = follower.seat["transport"]
         del follower
-        forget(transport)
+        remove_files(transport)
         return 1
     return 128 + terminated[0] if terminated else 0
 

@@ -1,6 +1,6 @@
-"""The follower of examples/motor-pair, by the links of follower.py: a seat is the same whatever the rig.
+"""A foreign follower for examples/motor-pair, with the links of follower.py, which do not depend on the rig.
 
-Must not know more of the motor than the scenario in the seat says.
+Must not know more of the motor than the scenario in the seat contains.
 """
 
 import math
@@ -10,17 +10,17 @@ import follower
 
 
 class Motor:
-    """J dw/dt = k i - b w, under a held current."""
+    """J dw/dt = k i - b w, under a constant current."""
 
     RIG = "motor-pair"
 
     def __init__(self, scenario, _name):
         motor = scenario["motor"]
-        self.end = motor["torque_n_m_per_a"] / motor["friction_n_m_s"]
+        self.gain = motor["torque_n_m_per_a"] / motor["friction_n_m_s"]
         self.rate = motor["friction_n_m_s"] / motor["inertia_kg_m2"]
         self.speed, self.current = 0.0, 0.0
 
-    def believes(self, command):
+    def accepts(self, command):
         return math.isfinite(command.current_a)
 
     def apply(self, command):
@@ -36,8 +36,8 @@ class Motor:
         return {**self.measured(), "load_n_m": 0.0}
 
     def flow(self, dt_s):
-        end = self.end * self.current
-        self.speed = end + (self.speed - end) * math.exp(-self.rate * dt_s)
+        steady_speed = self.gain * self.current
+        self.speed = steady_speed + (self.speed - steady_speed) * math.exp(-self.rate * dt_s)
 
 
 if __name__ == "__main__":

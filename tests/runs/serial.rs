@@ -1,5 +1,5 @@
-//! A device behind a serial line in the follower's seat: the real program, a device in a thread, and between them a cable
-//! of two ptys that can be faulty, cut, and joined again.
+//! Devices behind a serial line: the bridge as a process, the device in a thread, and between them a cable of two ptys that may be
+//! faulty, unplugged and plugged in again.
 
 #[path = "../../examples/serial_device.rs"]
 mod serial_device;
@@ -31,7 +31,7 @@ use std::time::Duration;
 
 const NAP: Duration = Duration::from_micros(50);
 
-/// One end of a cable: a pty whose near end stands for a serial port. It stays raw and open while nobody uses it.
+/// One end of a cable: a pty whose near end replaces a serial port. It stays raw and open while unused.
 struct Port {
     far: OwnedFd,
     _near: OwnedFd,
@@ -56,20 +56,20 @@ impl Port {
         rustix::io::read(&self.far, bytes).unwrap_or(0)
     }
 
-    /// What a full line does not take is lost, as it is on a real one.
+    /// Writes bytes; a full line loses them, like a real one.
     fn write(&self, bytes: &[u8]) {
         let _ = rustix::io::write(&self.far, bytes);
     }
 }
 
-/// What befalls bytes on their way: probabilities per byte, and the longest delay of a read's worth of them.
+/// Faults of a cable: probabilities per byte, and the longest delay of the bytes of one read.
 #[derive(Clone, Copy)]
 struct Faults {
     drop: f64,
     corrupt: f64,
     garbage: f64,
     delay: Duration,
-    /// Whether the bytes are cut into pieces and joined at random.
+    /// True if reads are split into random pieces.
     pieces: bool,
 }
 
@@ -79,8 +79,8 @@ const CLEAN: Faults = Faults { drop: 0.0, corrupt: 0.0, garbage: 0.0, delay: Dur
 struct Cable {
     host: Arc<Port>,
     device: Arc<Port>,
-    whole: Arc<AtomicBool>,
-    /// Bytes that came to the device's end.
+    on: Arc<AtomicBool>,
+    /// Number of bytes that reached the device's end.
     carried: Arc<AtomicUsize>,
     pumps: Vec<JoinHandle<()>>,
 }
@@ -88,17 +88,17 @@ struct Cable {
 impl Cable {
     fn new(faults: Faults) -> Self {
         let (host, device) = (Arc::new(Port::new()), Arc::new(Port::new()));
-        let whole = Arc::new(AtomicBool::new(true));
+        let on = Arc::new(AtomicBool::new(true));
         let carried = Arc::new(AtomicUsize::new(0));
         let pump = |from: &Arc<Port>, to: &Arc<Port>, seed, carried: Option<&Arc<AtomicUsize>>| {
-            let (from, to, whole, carried) = (from.clone(), to.clone(), whole.clone(), carried.cloned());
-            std::thread::spawn(move || pump(&from, &to, faults, seed, &whole, carried.as_deref()))
+            let (from, to, on, carried) = (from.clone(), to.clone(), on.clone(), carried.cloned());
+            std::thread::spawn(move || pump(&from, &to, faults, seed, &on, carried.as_deref()))
         };
         let pumps = vec![pump(&host, &device, 1, Some(&carried)), pump(&device, &host, 2, None)];
-        Self { host, device, whole, carried, pumps }
+        Self { host, device, on, carried, pumps }
     }
 
-    /// Waits until ticks run over it: some hundred of them have.
+    /// Waits until about a hundred ticks have crossed the cable.
     fn await_ticks(&self) {
         await_some(|| (self.carried.load(Ordering::Relaxed) > 10_000).then_some(()));
     }
@@ -106,15 +106,15 @@ impl Cable {
 
 impl Drop for Cable {
     fn drop(&mut self) {
-        self.whole.store(false, Ordering::Relaxed);
+        self.on.store(false, Ordering::Relaxed);
         self.pumps.drain(..).for_each(|pump| pump.join().unwrap());
     }
 }
 
-fn pump(from: &Port, to: &Port, faults: Faults, seed: u64, whole: &AtomicBool, carried: Option<&AtomicUsize>) {
+fn pump(from: &Port, to: &Port, faults: Faults, seed: u64, on: &AtomicBool, carried: Option<&AtomicUsize>) {
     let (mut random, mut bytes) = (Pcg64::seed_from_u64(seed), [0; 4096]);
     let mut uniform = move || random.next_u64() as f64 / u64::MAX as f64;
-    while whole.load(Ordering::Relaxed) {
+    while on.load(Ordering::Relaxed) {
         let count = from.read(&mut bytes);
         if count == 0 {
             std::thread::sleep(NAP);
@@ -154,20 +154,20 @@ struct Powered {
 }
 
 impl Powered {
-    /// Runs `life` in a thread; it ends when the flag it is given is cleared.
+    /// Runs `life` in a thread until its flag is cleared.
     fn new(life: impl FnOnce(&AtomicBool) + Send + 'static) -> Self {
         let on = Arc::new(AtomicBool::new(true));
         let flag = on.clone();
         Self { on, thread: Some(std::thread::spawn(move || life(&flag))) }
     }
 
-    /// The reference device: `examples/serial_device.rs`.
+    /// Starts the reference device, `examples/serial_device.rs`.
     fn reference(path: &Path) -> Self {
         let path = path.to_owned();
         Self::new(move |on| live(&path, &mut Device::new(NAME, Follower::asked_for), on))
     }
 
-    /// A device with any role of any rig.
+    /// Starts a device with any role of any rig.
     fn of_rig(path: &Path, scenario: Scenario, role: &'static str) -> Self {
         let path = path.to_owned();
         Self::new(move |on| with_shipped_rig!(scenario.rig, rig => any_role(rig, role, &path, on)))
@@ -177,19 +177,19 @@ impl Powered {
 impl Drop for Powered {
     fn drop(&mut self) {
         self.on.store(false, Ordering::Relaxed);
-        let ended = self.thread.take().map(JoinHandle::join);
-        assert!(std::thread::panicking() || matches!(ended, Some(Ok(()))), "the device failed");
+        let result = self.thread.take().map(JoinHandle::join);
+        assert!(std::thread::panicking() || matches!(result, Some(Ok(()))), "the device failed");
     }
 }
 
-/// The role of this name, or the body; controllers are of one driven body.
+/// Serves the role of this name, or the body otherwise; controllers have one driven body.
 fn any_role<R: Rig>(rig: &R, role: &str, path: &Path, on: &AtomicBool) {
-    let asked = |hello: &Hello<'_>| assert_eq!(hello.role, role);
+    let check_role = |hello: &Hello<'_>| assert_eq!(hello.role, role);
     match role {
         "observer" => live(
             path,
             &mut Device::new("any", |hello| {
-                asked(hello);
+                check_role(hello);
                 Some(DeviceObserver::new(rig.estimator(), hello))
             }),
             on,
@@ -197,7 +197,7 @@ fn any_role<R: Rig>(rig: &R, role: &str, path: &Path, on: &AtomicBool) {
         "controller" => live(
             path,
             &mut Device::new("any", |hello| {
-                asked(hello);
+                check_role(hello);
                 Some(DeviceController::new([rig.law(1)]))
             }),
             on,
@@ -205,7 +205,7 @@ fn any_role<R: Rig>(rig: &R, role: &str, path: &Path, on: &AtomicBool) {
         "observer controller" => live(
             path,
             &mut Device::new("any", |hello| {
-                asked(hello);
+                check_role(hello);
                 Some(DeviceFlightComputer::new(rig.estimator(), [rig.law(1)], hello))
             }),
             on,
@@ -213,7 +213,7 @@ fn any_role<R: Rig>(rig: &R, role: &str, path: &Path, on: &AtomicBool) {
         _ => live(
             path,
             &mut Device::new("any", |hello| {
-                asked(hello);
+                check_role(hello);
                 Some(DevicePlant::new(rig.body(1), hello))
             }),
             on,
@@ -221,7 +221,7 @@ fn any_role<R: Rig>(rig: &R, role: &str, path: &Path, on: &AtomicBool) {
     }
 }
 
-/// A device keeps its state while its line is cut and joined again.
+/// Serves a device, which keeps its state while its line is unplugged and plugged in again.
 fn live<S: DeviceRole, M: FnMut(&Hello<'_>) -> Option<S>>(path: &Path, device: &mut Device<S, M>, on: &AtomicBool) {
     while on.load(Ordering::Relaxed) {
         match Line::open(path, None) {
@@ -231,12 +231,12 @@ fn live<S: DeviceRole, M: FnMut(&Hello<'_>) -> Option<S>>(path: &Path, device: &
     }
 }
 
-/// Starts a run whose follower somebody else is; gives its domain too.
+/// Starts a run with an external follower. Returns it with its domain.
 fn start(bench: &Bench, file: &Path, arguments: &[&str]) -> (Running, PathBuf) {
     start_without(bench, file, &["follower"], arguments)
 }
 
-/// The same for any roles.
+/// Starts a run with external roles. Returns it with its domain.
 fn start_without(bench: &Bench, file: &Path, roles: &[&str], arguments: &[&str]) -> (Running, PathBuf) {
     let common = ["run", file.to_str().unwrap(), "--json", "--out", "out", "--overwrite"];
     let external: Vec<&str> = roles.iter().flat_map(|role| ["--external", *role]).collect();
@@ -255,18 +255,18 @@ fn bridge_of(bench: &Bench, roles: &str, path: &Path, domain: &Path, arguments: 
     bench.start(&[&common[..], arguments].concat())
 }
 
-/// Runs a shipped scenario with the device at `path` in the follower's seat.
+/// Runs a shipped scenario with the device at `path` as the follower.
 fn run_with(bench: &Bench, scenario: &str, path: &Path, arguments: &[&str]) -> Value {
     let (run, domain) = start(bench, &shipped(scenario), arguments);
     let bridge = bridge(bench, path, &domain, &[]);
     let (run, bridge) = (run.wait(), bridge.wait());
     assert!(bridge.stderr.contains("line of follower: "), "{bridge:?}");
     bench.assert_clean(&[domain]);
-    served(&run, &bridge)
+    summary_of(&run, &bridge)
 }
 
-/// The summary of a run. A machine that withholds the processor from a device for long makes it absent; then both ends tell.
-fn served(run: &Done, bridge: &Done) -> Value {
+/// Returns the summary of a run. On a loaded machine the device may be absent for a while; run and bridge then both report it.
+fn summary_of(run: &Done, bridge: &Done) -> Value {
     let summary = run.json();
     assert_eq!(run.code, Some(0), "{run:?}");
     let absent = incidents(&summary, "continued").iter().any(|incident| incident["replaced_by"].is_null());
@@ -275,29 +275,28 @@ fn served(run: &Done, bridge: &Done) -> Value {
     summary
 }
 
-/// The incidents of a run about which this was done.
+/// Returns the incidents of a run with the given action.
 fn incidents(summary: &Value, action: &str) -> Vec<Value> {
     let all = summary["incidents"].as_array().unwrap();
     all.iter().filter(|incident| incident["action"] == action).cloned().collect()
 }
 
 fn number(value: &Value) -> u64 {
-    value.as_u64().unwrap_or_else(|| panic!("{value} is no count"))
+    value.as_u64().unwrap_or_else(|| panic!("{value} is not a count"))
 }
 
-/// The error of the first metric at the end of a run.
+/// Returns the first metric at the end of a run.
 fn sync_error(summary: &Value) -> f64 {
     assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
     summary["score"]["metrics"][0]["last"].as_f64().unwrap()
 }
 
 const LOCKSTEP: [&str; 6] = ["--clock", "lockstep", "--tick-hz", "100", "--duration", "10"];
-/// A loaded machine may keep a bridge from saying anything for seconds.
+/// On a loaded machine a bridge may send no heartbeat for seconds.
 const PATIENT: &str = "--set=supervision.heartbeat_timeout_s=60";
 const REALTIME: [&str; 9] =
     ["--clock", "realtime", "--tick-hz", "100", "--duration", "8", "--set", "accept={}", PATIENT];
 
-/// The device computes with the same pure plant: nothing of the run tells that it sits behind a line.
 #[test]
 fn in_lockstep_a_device_gives_the_bits_of_the_built_in_follower() {
     let bench = Bench::new();
@@ -313,7 +312,7 @@ fn in_lockstep_a_device_gives_the_bits_of_the_built_in_follower() {
     drop(device);
 }
 
-/// Every request is repeated until it is answered, and no tick is executed twice: no fault reaches the bits.
+/// Requests are repeated until they are answered, and no tick is executed twice.
 #[test]
 fn in_lockstep_a_faulty_line_gives_the_same_bits() {
     let bench = Bench::new();
@@ -328,7 +327,6 @@ fn in_lockstep_a_faulty_line_gives_the_same_bits() {
     assert_eq!(number(&line["unanswered"]), 0, "{line}");
 }
 
-/// The protocol knows no rig.
 #[test]
 fn a_device_may_be_the_body_of_any_rig() {
     let bench = Bench::new();
@@ -341,20 +339,20 @@ fn a_device_may_be_the_body_of_any_rig() {
     assert_eq!(with_device["state"]["hash"], bench.summary("orbit-rendezvous", &arguments)["state"]["hash"]);
 }
 
-/// The seats that a device can have beside a body's, as the command line names them and as a device hears them.
+/// The roles that a device can have besides a body, as on the command line and as in the greeting.
 const COMPUTERS: [(&[&str], &str); 3] = [
     (&["observer"], "observer"),
     (&["controller"], "controller"),
     (&["observer", "controller"], "observer controller"),
 ];
 
-/// Runs a shipped scenario with a device in the seats of these roles.
+/// Runs a shipped scenario with a device that has the given roles.
 fn run_roles(bench: &Bench, scenario: &str, roles: &[&str], path: &Path, arguments: &[&str]) -> Value {
     let (run, domain) = start_without(bench, &shipped(scenario), roles, arguments);
     let bridge = bridge_of(bench, &roles.join(","), path, &domain, &[]);
     let (run, bridge) = (run.wait(), bridge.wait());
     bench.assert_clean(&[domain]);
-    served(&run, &bridge)
+    summary_of(&run, &bridge)
 }
 
 fn short(scenario: &str, arguments: &[&str]) -> Scenario {
@@ -362,7 +360,7 @@ fn short(scenario: &str, arguments: &[&str]) -> Scenario {
     Scenario::parse(&std::fs::read_to_string(shipped(scenario)).unwrap(), "test", &overrides).unwrap()
 }
 
-/// What computes sits behind the line, what moves is simulated here: processor in the loop.
+/// Processor in the loop: the plants are simulated.
 #[test]
 fn in_lockstep_a_device_may_be_observer_or_controller_or_both_in_any_rig() {
     let bench = Bench::new();
@@ -375,7 +373,7 @@ fn in_lockstep_a_device_may_be_observer_or_controller_or_both_in_any_rig() {
             let with_device = run_roles(&bench, name, roles, &cable.host.path, &arguments);
             assert_eq!(with_device["state"]["hash"], built_in["state"]["hash"], "{name}: {role}");
             assert_eq!(with_device["books"]["roles"], built_in["books"]["roles"], "{name}: {role}");
-            // One for all roles of a line; a device that is served late is greeted again after 8 requests, 7 of them repeated.
+            // All roles of a line share one handshake. A late device is greeted again after 8 requests, 7 of them repeated.
             let line = &with_device["lines"][roles[0]];
             let (handshakes, repeats) = (number(&line["handshakes"]), number(&line["repeats"]));
             assert!(handshakes >= 1 && 7 * (handshakes - 1) <= repeats, "{line:#}");
@@ -383,9 +381,9 @@ fn in_lockstep_a_device_may_be_observer_or_controller_or_both_in_any_rig() {
     }
 }
 
-/// The leader's measurements that are dropped, and a follower's, come to such a device as to ours.
+/// Dropped and out-of-range measurements are injected as well.
 #[test]
-fn in_lockstep_a_flight_computer_on_a_faulty_line_that_misses_samples_gives_the_same_bits() {
+fn in_lockstep_a_flight_computer_on_a_faulty_line_gives_the_same_bits() {
     let bench = Bench::new();
     let faults = Faults { drop: 3e-4, corrupt: 3e-4, garbage: 3e-4, delay: Duration::from_millis(2), pieces: true };
     let cable = Cable::new(faults);
@@ -425,9 +423,8 @@ fn in_real_time_a_flight_computer_synchronises() {
     );
 }
 
-/// What a flight computer does not answer in time is missed, and the next tick is asked for.
 #[test]
-fn a_flight_computer_that_pauses_misses_what_it_slept_through_and_no_more() {
+fn a_flight_computer_that_pauses_misses_the_ticks_of_its_pause() {
     const PAUSE: Duration = Duration::from_millis(300);
     let bench = Bench::new();
     let cable = Cable::new(CLEAN);
@@ -451,21 +448,20 @@ fn a_flight_computer_that_pauses_misses_what_it_slept_through_and_no_more() {
             }
         })
     });
-    let longer = REALTIME.map(|word| if word == "8" { "30" } else { word });
+    let longer = REALTIME.map(|argument| if argument == "8" { "30" } else { argument });
     let summary = run_roles(&bench, "rigid-pair", &["observer", "controller"], &cable.host.path, &longer);
     let books = &summary["books"]["roles"];
     println!("{books}; line {}", summary["lines"]["observer"]);
     assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
     for role in ["observer", "controller"] {
         assert!(number(&books[role]["missed"]) >= 28, "{books}");
-        // A machine that withholds the processor misses more; whoever does not go on has executed 50 at the most.
+        // A loaded machine misses more. A role that stops at the pause has executed at most 50.
         assert!(number(&books[role]["executed"]) > 100, "{books}");
     }
 }
 
-/// The plants have their expiry, whoever is to command them.
 #[test]
-fn a_flight_computer_that_falls_silent_leaves_its_plants_safe_and_another_one_takes_its_seat() {
+fn plants_go_safe_while_a_flight_computer_is_silent_and_another_replaces_it() {
     let bench = Bench::new();
     let cable = Cable::new(CLEAN);
     let flight = |path: &Path| {
@@ -477,9 +473,9 @@ fn a_flight_computer_that_falls_silent_leaves_its_plants_safe_and_another_one_ta
     };
     let device = flight(&cable.device.path);
     let roles = ["observer", "controller"];
-    let longer = REALTIME.map(|word| if word == "8" { "16" } else { word });
+    let longer = REALTIME.map(|argument| if argument == "8" { "16" } else { argument });
     let (run, domain) = start_without(&bench, &shipped("rigid-pair"), &roles, &longer);
-    // A device that is only served late must not be given up before the test takes it away.
+    // The bridge must not give a late device up before the test removes it.
     let first = bridge_of(&bench, "observer,controller", &cable.host.path, &domain, &["--patience", "5"]);
     cable.await_ticks();
     drop(device);
@@ -489,8 +485,8 @@ fn a_flight_computer_that_falls_silent_leaves_its_plants_safe_and_another_one_ta
     let _device = flight(&cable.device.path);
     let second = bridge_of(&bench, "observer,controller", &cable.host.path, &domain, &[]);
     let (run, second) = (run.wait(), second.wait());
-    let summary = served(&run, &second);
-    // The seat of each role changed hands.
+    let summary = summary_of(&run, &second);
+    // The second device has replaced the first in both roles.
     let replaced = incidents(&summary, "continued");
     for role in roles {
         let found = replaced.iter().find(|incident| incident["role"] == role && incident["replaced_by"].is_object());
@@ -536,19 +532,19 @@ fn in_real_time_a_device_synchronises() {
     let line = &summary["lines"]["follower"];
     println!("{error:e} rad/s; follower {ticks}; line {line}");
     assert_eq!(number(&ticks["executed"]) + number(&ticks["missed"]), 801);
-    // A machine that withholds the processor gives a slower loop, and says so.
+    // A loaded machine misses ticks, and the bodies synchronise later.
     let limit = if number(&summary["books"]["missed_ticks"]) < 200 { 1e-6 } else { 1.0 };
     assert!(error < limit, "{error:e}: {summary:#}");
     let serial = summary["latencies"].as_array().unwrap().iter().find(|stage| stage["stage"] == "serial").unwrap();
     println!("round trip {serial}");
-    let told = number(&serial["count"]) - number(&serial["missed"]);
-    assert_eq!((&serial["role"], told), (&Value::from("follower"), number(&ticks["executed"])));
+    let answered = number(&serial["count"]) - number(&serial["missed"]);
+    assert_eq!((&serial["role"], answered), (&Value::from("follower"), number(&ticks["executed"])));
     assert!(bench.path("out/latency/follower.serial.hgrm").is_file());
 }
 
-/// What is lost is counted as missed; the bodies synchronise all the same.
+/// Lost ticks count as missed.
 #[test]
-fn in_real_time_a_faulty_line_costs_ticks_and_not_the_goal() {
+fn in_real_time_the_bodies_synchronise_over_a_faulty_line() {
     let bench = Bench::new();
     let faults = Faults { drop: 3e-4, corrupt: 3e-4, garbage: 3e-4, delay: Duration::from_millis(2), pieces: true };
     let cable = Cable::new(faults);
@@ -564,7 +560,7 @@ fn in_real_time_a_faulty_line_costs_ticks_and_not_the_goal() {
     assert!(error < limit, "{error:e}: {summary:#}");
 }
 
-/// Noise on the line before anybody says anything, and all the time after.
+/// There is noise on the line before the handshake and during the run.
 #[test]
 fn garbage_before_the_handshake_is_dropped_and_counted() {
     let bench = Bench::new();
@@ -587,8 +583,8 @@ fn garbage_before_the_handshake_is_dropped_and_counted() {
     assert_eq!(summary["state"]["hash"], bench.summary("rigid-pair", &LOCKSTEP)["state"]["hash"]);
 }
 
-/// A cable under names of its own, which go when it is unplugged, as those of a USB adapter do: the numbers of ptys are used
-/// again at once, by whoever comes next.
+/// A cable whose ports have names that disappear when it is unplugged, like those of a USB adapter. The names of ptys are not used,
+/// because the next pty takes them at once.
 struct Adapter {
     names: [PathBuf; 2],
     cable: Cable,
@@ -611,7 +607,7 @@ impl Drop for Adapter {
 }
 
 #[test]
-fn a_device_that_is_unplugged_and_plugged_in_again_goes_on() {
+fn a_device_that_is_unplugged_and_plugged_in_again_continues() {
     let bench = Bench::new();
     let adapter = Adapter::plug_in(&bench);
     let _device = Powered::reference(&bench.path("tty-device"));
@@ -622,13 +618,13 @@ fn a_device_that_is_unplugged_and_plugged_in_again_goes_on() {
     std::thread::sleep(Duration::from_millis(500));
     let _adapter = Adapter::plug_in(&bench);
     let (run, bridge) = (run.wait(), bridge.wait());
-    // A command lasts 50 ms, and the cable was out for longer.
+    // A command expires after 50 ms, and the cable was unplugged for longer.
     assert_eq!(bridge.code, Some(4), "{bridge:?} {run:?}");
     let summary = run.succeeded().json();
     let absent = incidents(&summary, "continued");
-    let cut = absent.iter().find(|incident| incident["cause"].as_str().unwrap().contains("was cut"));
-    let cut = cut.unwrap_or_else(|| panic!("{absent:?}"));
-    assert_eq!((&cut["role"], cut["outage_s"].as_f64().unwrap() > 0.3), (&Value::from("follower"), true), "{cut}");
+    let is_long = |incident: &&Value| incident["outage_s"].as_f64().is_some_and(|outage_s| outage_s > 0.3);
+    let outage = absent.iter().find(is_long).unwrap_or_else(|| panic!("{absent:?}"));
+    assert_eq!(outage["role"], "follower", "{outage}");
     let (error, ticks) = (sync_error(&summary), &summary["books"]["roles"]["follower"]);
     let line = &summary["lines"]["follower"];
     println!("{error:e} rad/s; follower {ticks}; line {line}");
@@ -640,7 +636,7 @@ fn a_device_that_is_unplugged_and_plugged_in_again_goes_on() {
 }
 
 #[test]
-fn a_device_that_does_not_come_back_ends_the_bridge_with_the_reason() {
+fn a_bridge_whose_device_stays_unplugged_ends_with_a_reason() {
     let bench = Bench::new();
     let adapter = Adapter::plug_in(&bench);
     let _device = Powered::reference(&bench.path("tty-device"));
@@ -650,14 +646,14 @@ fn a_device_that_does_not_come_back_ends_the_bridge_with_the_reason() {
     drop(adapter);
     let bridge = bridge.wait();
     assert_eq!(bridge.code, Some(4), "{bridge:?}");
-    assert!(bridge.stderr.contains("has not answered for") && bridge.stderr.contains("plugged in"), "{bridge:?}");
+    assert!(bridge.says("device-silent"), "{bridge:?}");
     run.signal(SIGINT);
     run.wait();
 }
 
-/// The run goes on without it; both programs tell that it was not there.
+/// The run goes on without it.
 #[test]
-fn a_controller_whose_line_stays_cut_is_an_incident_with_tick_and_time() {
+fn a_controller_that_stays_unplugged_is_an_incident_with_tick_and_time() {
     let bench = Bench::new();
     let adapter = Adapter::plug_in(&bench);
     let scenario = short("rigid-pair", &["duration_s=8", "tick_hz=100", "accept={}"]);
@@ -668,21 +664,21 @@ fn a_controller_whose_line_stays_cut_is_an_incident_with_tick_and_time() {
     drop(adapter);
     let (run, bridge) = (run.wait(), bridge.wait());
     assert_eq!(bridge.code, Some(4), "{bridge:?} {run:?}");
-    let told = bridge.json();
+    let report = bridge.json();
     let summary = run.json();
     let absent = incidents(&summary, "continued");
     let last = absent.last().unwrap_or_else(|| panic!("{summary:#}"));
     assert_eq!((&last["role"], &last["outage_s"]), (&Value::from("controller"), &Value::Null), "{last}");
     assert!((last["time_s"].as_f64().unwrap() - number(&last["tick"]) as f64 / 100.0).abs() < 1e-9, "{last}");
-    let outage = told["outages"].as_array().unwrap().last().unwrap();
+    let outage = report["outages"].as_array().unwrap().last().unwrap();
     assert_eq!((&outage["tick"], &outage["back_at_tick"]), (&last["tick"], &Value::Null));
     assert!(outage["seconds"].as_f64().unwrap() > 0.5, "{outage}");
     bench.assert_clean(&[domain]);
 }
 
-/// A device of another name is not taken for the one that was there, unless it is allowed; then it is told.
+/// A device with another name is refused, or with --allow-other-device accepted and reported.
 #[test]
-fn another_device_on_the_line_is_refused_or_told() {
+fn a_device_with_another_name_ends_the_run_unless_allowed() {
     for (options, code) in [(&["--patience", "60"][..], 4), (&["--patience", "60", "--allow-other-device"], 0)] {
         let bench = Bench::new();
         let cable = Cable::new(CLEAN);
@@ -693,20 +689,20 @@ fn another_device_on_the_line_is_refused_or_told() {
         cable.await_ticks();
         drop(device);
         let scenario = short("rigid-pair", &["duration_s=60", "tick_hz=100", "accept={}"]);
-        let _other = Powered::of_rig(&cable.device.path, scenario, "follower");
+        let _device = Powered::of_rig(&cable.device.path, scenario, "follower");
         let (run, bridge) = (run.wait(), bridge.wait());
         assert_eq!((bridge.code, run.code), (Some(code), Some(code)), "{bridge:?} {run:?}");
         let summary = run.json();
-        let told = incidents(&summary, if code == 0 { "continued" } else { "stopped" });
-        let words = |incident: &Value| format!("{} {}", incident["cause"], incident["last_words"]);
-        assert!(told.len() == 1 && words(&told[0]).contains("any"), "{told:?}");
+        let replaced = incidents(&summary, if code == 0 { "continued" } else { "stopped" });
+        let text = |incident: &Value| format!("{} {}", incident["cause"], incident["last_words"]);
+        assert!(replaced.len() == 1 && text(&replaced[0]).contains("any"), "{replaced:?}");
         assert!(code == 0 || bridge.stderr.contains(NAME), "{bridge:?}");
         bench.assert_clean(&[domain]);
     }
 }
 
-/// Answers every frame with the bytes that `reply` makes of its payload.
-fn impostor(path: &Path, reply: fn(&[u8]) -> Vec<u8>) -> Powered {
+/// Starts a device that answers every frame with the bytes that `reply` returns for its payload.
+fn scripted(path: &Path, reply: fn(&[u8]) -> Vec<u8>) -> Powered {
     let path = path.to_owned();
     Powered::new(move |on| {
         let (mut line, mut decoder, mut bytes) = (Line::open(&path, None).unwrap(), Decoder::default(), [0; 512]);
@@ -724,7 +720,7 @@ fn framed(payload: &[u8]) -> Vec<u8> {
     encode(payload, &mut [0; MAX_FRAME]).unwrap().to_vec()
 }
 
-/// A bridge to `device` must end by itself with this code, and say all of these.
+/// Asserts that a bridge to `device` ends with this exit code and prints all `words`.
 fn refused(device: impl FnOnce(&Path) -> Option<Powered>, arguments: &[&str], code: i32, words: &[&str]) {
     let bench = Bench::new();
     let cable = Cable::new(CLEAN);
@@ -741,13 +737,13 @@ fn refused(device: impl FnOnce(&Path) -> Option<Powered>, arguments: &[&str], co
 }
 
 #[test]
-fn a_device_of_another_version_is_refused_by_both_versions() {
-    let other = |path: &Path| Some(impostor(path, |_| framed(&[1, 0, 2, 0, 0])));
-    refused(other, &[], 2, &["protocol version 1", "this program version 2", "update the older"]);
+fn a_device_with_another_protocol_version_is_refused_naming_both_versions() {
+    let outdated = |path: &Path| Some(scripted(path, |_| framed(&[1, 0, 2, 0, 0])));
+    refused(outdated, &[], 2, &["version 1", "version 2"]);
 }
 
 #[test]
-fn a_device_of_another_rig_is_refused_by_both_types() {
+fn a_device_of_another_rig_is_refused_naming_both_sample_types() {
     let orbit = |path: &Path| {
         let scenario = Scenario::load(&shipped("orbit-rendezvous"), &[]).unwrap();
         Some(Powered::of_rig(path, scenario, "follower"))
@@ -755,8 +751,8 @@ fn a_device_of_another_rig_is_refused_by_both_types() {
     refused(orbit, &[], 2, &["corotate/orbit/command/v1", "corotate/rigid-body/command/v2"]);
 }
 
-/// The answer of a device to a greeting.
-fn answered(message: Message<'_>) -> Vec<u8> {
+/// Returns the frame of a message from a device.
+fn frame(message: Message<'_>) -> Vec<u8> {
     framed(write(0, message, &mut [0; MAX_PAYLOAD]).unwrap())
 }
 
@@ -766,85 +762,83 @@ const SWAPPED: &str = "corotate/rigid-body/command/v2#00000000";
 
 #[test]
 fn a_device_with_other_fields_under_the_same_type_name_is_refused() {
-    let reply = |_: &[u8]| answered(Message::Refuse(Refuse { reason: Reason::Samples, detail: SWAPPED }));
-    refused(|path: &Path| Some(impostor(path, reply)), &[], 2, &[SWAPPED, RateCommand::LAYOUT]);
+    let reply = |_: &[u8]| frame(Message::Refuse(Refuse { reason: Reason::Samples, detail: SWAPPED }));
+    refused(|path: &Path| Some(scripted(path, reply)), &[], 2, &[SWAPPED, RateCommand::LAYOUT]);
 }
 
-/// A device of protocol version 2 from before layouts had hashes. This one falls silent after the greeting.
+/// Devices of protocol version 2 from before layouts had hashes. This one falls silent after the greeting.
 #[test]
-fn a_device_that_knows_type_names_only_is_greeted_so_and_named() {
+fn a_device_without_layout_hashes_is_greeted_without_them() {
     let bare = |path: &Path| {
         let reply = |payload: &[u8]| match parse(payload) {
             Ok((_, Message::Hello(hello))) if hello.reads == COMMAND && !hello.writes.contains('#') => {
-                answered(Message::Welcome(Welcome { run: hello.run, next_tick: 0, device: "old 1" }))
+                frame(Message::Welcome(Welcome { run: hello.run, next_tick: 0, device: "old 1" }))
             }
-            Ok((_, Message::Hello(_))) => {
-                answered(Message::Refuse(Refuse { reason: Reason::Samples, detail: COMMAND }))
-            }
+            Ok((_, Message::Hello(_))) => frame(Message::Refuse(Refuse { reason: Reason::Samples, detail: COMMAND })),
             _ => Vec::new(),
         };
-        Some(impostor(path, reply))
+        Some(scripted(path, reply))
     };
-    refused(bare, &["--patience", "2"], 4, &["old 1 (states no layouts", "has not answered for"]);
+    refused(bare, &["--patience", "2"], 4, &["old 1", "[device-silent]"]);
 }
 
 #[test]
-fn a_device_that_never_answers_is_given_up() {
-    refused(|_| None, &["--patience", "0.5"], 1, &["has not answered for", "powered, wired"]);
+fn a_bridge_to_a_device_that_never_answers_ends() {
+    refused(|_| None, &["--patience", "0.5"], 1, &["[device-silent]"]);
 }
 
 #[test]
-fn a_looped_line_is_told_from_a_silent_one() {
-    let echo = |path: &Path| Some(impostor(path, framed));
-    refused(echo, &["--patience", "5"], 1, &["has not answered", "own frames came back"]);
+fn a_looped_line_is_named_as_the_cause() {
+    let echo = |path: &Path| Some(scripted(path, framed));
+    refused(echo, &["--patience", "5"], 1, &["[device-silent]", "looped"]);
 }
 
 #[test]
-fn a_line_at_another_speed_is_told_from_a_silent_one() {
-    let noise = |path: &Path| Some(impostor(path, |payload| vec![0x55; payload.len()]));
-    refused(noise, &["--patience", "5"], 1, &["has not answered", "no frame was among them", "--baud"]);
+fn a_line_at_another_speed_is_named_as_the_cause() {
+    let noise = |path: &Path| Some(scripted(path, |payload| vec![0x55; payload.len()]));
+    refused(noise, &["--patience", "5"], 1, &["[device-silent]", "--baud"]);
 }
 
 #[test]
-fn a_line_too_slow_for_the_tick_is_refused_with_the_least_speed() {
-    refused(|_| None, &["--baud", "9600"], 2, &["at 9600 baud", "give --baud", "tick_hz"]);
+fn a_line_too_slow_for_the_tick_is_refused() {
+    refused(|_| None, &["--baud", "9600"], 2, &["9600", "--baud", "tick_hz"]);
 }
 
 #[test]
-fn what_is_no_seat_or_no_line_is_refused_with_a_remedy() {
+fn a_bridge_refuses_wrong_roles_domains_and_files_that_are_not_lines() {
     let bench = Bench::new();
     let port = Port::new();
     let (run, domain) = start(&bench, &shipped("rigid-pair"), &REALTIME);
     let file = bench.path("file");
-    std::fs::write(&file, "no line").unwrap();
-    let ask = |path: &Path, body: &str, domain: &Path| {
+    std::fs::write(&file, "text").unwrap();
+    let refusal = |path: &Path, role: &str, domain: &Path| {
         let (path, domain) = (path.to_str().unwrap(), domain.to_str().unwrap());
-        let done = bench.run(&["bridge", "--serial", path, "--role", body, "--domain", domain]);
+        let done = bench.run(&["bridge", "--serial", path, "--role", role, "--domain", domain]);
         assert_eq!(done.code, Some(2), "{done:?}");
         done.stderr
     };
     for path in [&file, &domain, Path::new("/dev/null")] {
-        assert!(ask(path, "follower", &domain).contains("not a terminal device"));
+        assert!(refusal(path, "follower", &domain).contains("not a terminal device"));
     }
-    assert!(ask(&bench.path("none"), "follower", &domain).contains("plugged in"));
-    assert!(ask(&port.path, "leader", &domain).contains("one driven body"));
-    assert!(ask(&port.path, "nobody", &domain).contains("there is no role `nobody`"));
-    assert!(ask(&port.path, "follower", &bench.path("none")).contains("not the domain of a run"));
+    assert!(refusal(&bench.path("none"), "follower", &domain).contains("plugged in"));
+    assert!(refusal(&port.path, "leader", &domain).contains("one driven body"));
+    assert!(refusal(&port.path, "moon", &domain).contains("moon"));
+    assert!(refusal(&port.path, "follower", &bench.path("none")).contains("not the domain of a run"));
     let _held = Line::open(&port.path, None).unwrap();
-    assert!(ask(&port.path, "follower", &domain).contains("in use by another program"));
+    assert!(refusal(&port.path, "follower", &domain).contains("in use by another program"));
     run.signal(SIGINT);
     run.wait();
 }
 
 #[test]
-fn a_run_whose_commands_act_later_than_at_the_next_tick_is_no_run_for_a_device_that_is_a_body() {
+fn a_body_on_a_device_needs_an_actuation_delay_of_one_tick() {
     let bench = Bench::new();
     let port = Port::new();
     let (run, domain) =
         start(&bench, &shipped("rigid-pair"), &[&REALTIME[..], &["--set=actuation_delay_ticks=2"]].concat());
     let done = bridge(&bench, &port.path, &domain, &[]).wait();
     assert_eq!(done.code, Some(2), "{done:?}");
-    for word in ["actuation_delay_ticks = 2", "give 1", "simulated plant"] {
+    for word in ["[device-delay]", "actuation_delay_ticks = 2"] {
         assert!(done.stderr.contains(word), "{word}: {done:?}");
     }
     run.signal(SIGINT);
@@ -852,9 +846,9 @@ fn a_run_whose_commands_act_later_than_at_the_next_tick_is_no_run_for_a_device_t
     bench.assert_clean(&[domain]);
 }
 
-/// A bridge that dies takes nothing with it: the next one finds the books where they were, and a device that knows the run.
+/// The next bridge continues with the persistent counters, and the device recognises the run.
 #[test]
-fn a_bridge_that_was_killed_can_be_started_again() {
+fn a_killed_bridge_can_be_started_again() {
     let bench = Bench::new();
     let cable = Cable::new(CLEAN);
     let _device = Powered::reference(&cable.device.path);
@@ -873,9 +867,9 @@ fn a_bridge_that_was_killed_can_be_started_again() {
     bench.assert_clean(&[domain]);
 }
 
-/// A device that loses the run in the midst begins its body anew: the loop goes on, and is told what happened.
+/// Its body starts again at the initial state, and the run goes on.
 #[test]
-fn a_device_that_was_restarted_is_told_as_that() {
+fn a_restarted_device_is_reported_as_an_incident() {
     let bench = Bench::new();
     let cable = Cable::new(CLEAN);
     let device = Powered::reference(&cable.device.path);
@@ -887,40 +881,39 @@ fn a_device_that_was_restarted_is_told_as_that() {
     let _device = Powered::reference(&cable.device.path);
     let (run, bridge) = (run.wait(), bridge.wait());
     assert_eq!(bridge.code, Some(0), "{bridge:?} {run:?}");
-    let told = "1 times the device lost the run, its body at the initial state again";
     for text in [&bridge.stderr, &run.stderr] {
-        assert!(text.contains(told) && !text.contains("no fault"), "{text}");
+        assert!(text.contains("initial state") && !text.contains("no fault"), "{text}");
     }
     let summary = run.succeeded().json();
     let lost = incidents(&summary, "continued");
-    assert!(lost.len() == 1 && lost[0]["cause"].as_str().unwrap().contains("had lost the run"), "{lost:?}");
+    assert!(lost.len() == 1 && lost[0]["role"] == "follower", "{lost:?}");
     let line = &summary["lines"]["follower"];
-    // Who has not heard from its device for long greets it once more.
+    // A bridge greets a device again after a long silence.
     assert_eq!((number(&line["restarts"]), number(&line["handshakes"]) >= 2), (1, true), "{line}");
     assert!(number(&summary["state"]["first_disturbed_tick"]) > 0, "{}", summary["state"]);
     assert_ne!(summary["state"]["hash"], bench.summary("rigid-pair", &arguments)["state"]["hash"]);
     bench.assert_clean(&[domain]);
 }
 
-/// The device hears of the end, and is safe at once.
+/// The bridge sends the end of the run, upon which the device goes safe.
 #[test]
-fn a_bridge_that_is_interrupted_leaves_its_device_safe() {
+fn an_interrupted_bridge_leaves_its_device_safe() {
     let bench = Bench::new();
     let cable = Cable::new(CLEAN);
     let path = cable.device.path.clone();
     let safe = Arc::new(AtomicBool::new(true));
-    let told = safe.clone();
+    let flag = safe.clone();
     let _device = Powered::new(move |on| {
         let mut device = Device::new(NAME, Follower::asked_for);
         let mut line = Line::open(&path, None).unwrap();
         let mut bytes = [0; 512];
         while on.load(Ordering::Relaxed) {
             let count = line.read(&mut bytes);
-            // No clock: it is the word of the bridge that makes it safe, not silence.
+            // The device's clock stands at 0, so it cannot go safe by a timeout.
             device.receive(&bytes[..count], 0, |frame| {
                 line.write(frame);
             });
-            told.store(device.is_safe(), Ordering::Relaxed);
+            flag.store(device.is_safe(), Ordering::Relaxed);
             std::thread::sleep(NAP);
         }
     });
