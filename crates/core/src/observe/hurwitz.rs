@@ -32,7 +32,7 @@ const SHORT_INVERSES: [f64; 6] = [1.0 / 6.0, 1.0 / 5.0, 1.0 / 4.0, 1.0 / 3.0, 1.
 /// is: with the tolerance above, the accompanying powers of W stay below 1e200 up to N = 10.
 const VANISHED: f64 = 1200.0;
 
-/// The N eigenvalues of a real matrix, printed as a list.
+/// The N eigenvalues of a real matrix, printed as a list with four significant digits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Eigenvalues<const N: usize>(pub SVector<Complex<f64>, N>);
 
@@ -41,11 +41,28 @@ impl<const N: usize> fmt::Display for Eigenvalues<N> {
         for (index, value) in self.0.iter().enumerate() {
             formatter.write_str(if index == 0 { "" } else { ", " })?;
             match value.im {
-                0.0 => write!(formatter, "{}", value.re)?,
-                im => write!(formatter, "{}{im:+}i", value.re)?,
+                0.0 => write_rounded(formatter, value.re, false)?,
+                im => {
+                    write_rounded(formatter, value.re, false)?;
+                    write_rounded(formatter, im, true)?;
+                    formatter.write_str("i")?;
+                }
             }
         }
         Ok(())
+    }
+}
+
+/// Writes a number with four significant digits, and with its sign if `signed`.
+fn write_rounded(formatter: &mut fmt::Formatter<'_>, value: f64, signed: bool) -> fmt::Result {
+    let magnitude = libm::floor(libm::log10(value.abs()));
+    match (value != 0.0 && !(-4.0..4.0).contains(&magnitude), signed) {
+        (true, false) => write!(formatter, "{value:.3e}"),
+        (true, true) => write!(formatter, "{value:+.3e}"),
+        (false, _) => {
+            let decimals = if value == 0.0 { 0 } else { (3.0 - magnitude) as usize };
+            if signed { write!(formatter, "{value:+.decimals$}") } else { write!(formatter, "{value:.decimals$}") }
+        }
     }
 }
 
