@@ -39,7 +39,7 @@ pub fn main(py: Python<'_>, words: Vec<String>) -> u8 {
     py.detach(|| {
         let program =
             SHIPPED.iter().fold(Program::new().rigs(rigs()), |program, (name, text)| program.scenario(name, text));
-        program.obey(words.into_iter().map(Into::into).collect())
+        program.execute(words.into_iter().map(Into::into).collect())
     })
 }
 

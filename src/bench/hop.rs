@@ -86,8 +86,8 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake
     let lost: Vec<String> =
         pairs.iter().filter(|pair| pair.lost > 0).map(|pair| format!("{} {}", pair.name, pair.lost)).collect();
     if !lost.is_empty() {
-        let of = rounds * paced;
-        board.remark(format!("overtaken by the next before a late receiver looked, of {of}: {}", lost.join("; ")));
+        let total = rounds * paced;
+        board.remark(format!("overtaken by the next before a late receiver looked, of {total}: {}", lost.join("; ")));
     }
     Ok(())
 }

@@ -34,7 +34,7 @@ pub const ROWS: &[Row] = &[
     row("hop", "one hop between two processes on two cores", targets::HOP, hop::measure),
     row("chain", "leader -> observer -> controller: from tick to command sent", targets::CHAIN, chain::measure),
     row("tick", "how late a tick begins", targets::TICK, tick::measure),
-    row("lockstep", "ticks per second where nobody waits for the time", targets::LOCKSTEP, lockstep::measure),
+    row("lockstep", "ticks per second without waiting for real time", targets::LOCKSTEP, lockstep::measure),
     row("run", "a whole run: start, stop, memory", targets::RUN, run::measure),
     row(
         "overhead",

@@ -123,8 +123,8 @@ impl Bench<'_> {
             reasons.push("a debug build: its figures are not those of the product; build with --release".to_owned());
         }
         if !self.has_targets() {
-            let (of, this) = (SHIPPED[0].0, self.scenarios.first().map_or("none", |(name, _)| *name));
-            reasons.push(format!("the targets are those of corotate's scenario {of}, and this is {this}"));
+            let (judged, own) = (SHIPPED[0].0, self.scenarios.first().map_or("none", |(name, _)| *name));
+            reasons.push(format!("the targets are those of corotate's scenario {judged}, and this is {own}"));
         }
         reasons
     }

@@ -99,7 +99,7 @@ impl Target {
             AtMost(limit) => ("at most", limit, value.map(|value| value <= limit)),
             AtLeast(limit) => ("at least", limit, value.map(|value| value >= limit)),
         };
-        let of = match self.statistic {
+        let statistic = match self.statistic {
             Median => "",
             P50 => ", p50",
             P99 => ", p99",
@@ -107,7 +107,7 @@ impl Target {
         };
         let over = self.over.map_or(String::new(), |over| format!(" / {over}"));
         let unit = board.find(row, self.figure).filter(|_| self.over.is_none()).map_or("", |figure| figure.unit);
-        let what = format!("{}{over}{of}: {sign} {limit} {unit}", self.figure).trim_end().to_owned();
+        let what = format!("{}{over}{statistic}: {sign} {limit} {unit}", self.figure).trim_end().to_owned();
         Verdict { row, what, value, limit, met }
     }
 

@@ -44,7 +44,7 @@ pub struct Demand {
 
 impl Demand {
     /// Returns the demands of a scenario.
-    pub fn of(scenario: &Scenario) -> Self {
+    pub fn new(scenario: &Scenario) -> Self {
         Self {
             roles: RoleId::all(scenario).len(),
             cores: std::thread::available_parallelism().map_or(1, usize::from),

@@ -1,4 +1,4 @@
-//! `corotate bench`: the benchmark, from the rows asked for to a table, JSON and histograms.
+//! `corotate bench`: measures rows and writes a table, JSON and histograms.
 
 use super::output::{Exit, Failure, fail, print};
 use super::scenario::load;
@@ -19,13 +19,13 @@ pub struct Arguments {
     /// Rows to measure: hop, chain, tick, lockstep, run, overhead, processor [default: all]
     #[arg(value_name = "ROW")]
     rows: Vec<String>,
-    /// A smoke run of a few seconds, whose figures mean nothing
+    /// Run a smoke test of a few seconds; its figures are meaningless
     #[arg(long)]
     quick: bool,
-    /// Exit code 3 if a target is not met
+    /// Exit with code 3 if a target is not met
     #[arg(long)]
     check: bool,
-    /// Directory for the results [default: runs/<utc>-bench]
+    /// Directory of the results [default: runs/<utc>-bench]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Print the results as one JSON object on stdout, everything else on stderr
@@ -39,7 +39,7 @@ Examples:
   corotate bench chain hop --quick          two rows, as a smoke test
   corotate bench hop --check                exit code 3 if a target is missed";
 
-/// Options of the hidden command by which the suite starts the other end of a hop.
+/// Options of the hidden command that is the other end of a hop.
 #[derive(clap::Args)]
 pub struct PeerArguments {
     /// The suite's domain
@@ -48,12 +48,12 @@ pub struct PeerArguments {
     /// Die with this process
     #[arg(long)]
     parent: i32,
-    /// Take the observer's place, not the controller's
+    /// Replace the observer, not the controller
     #[arg(long)]
     observer: bool,
 }
 
-/// Measures what was asked for of these rows.
+/// Measures the selected rows.
 pub fn bench(arguments: &Arguments, rows: &[Row]) -> Exit {
     match attempt(arguments, rows) {
         Ok(results) if arguments.check && !results.met() => Exit::NotAccepted,
@@ -66,7 +66,7 @@ fn attempt(arguments: &Arguments, rows: &[Row]) -> Result<Results, (Exit, Failur
     let broken = |code, reason: String| (Exit::Failure, Failure::new(code, reason));
     let known = rows.iter().map(|row| row.name).collect::<Vec<_>>();
     if let Some(name) = arguments.rows.iter().find(|name| !known.contains(&name.as_str())) {
-        let text = format!("there is no row `{name}`; there are {}", known.join(", "));
+        let text = format!("there is no row `{name}`; choose from {}", known.join(", "));
         return Err((Exit::Usage, Failure::new("unknown-row", text)));
     }
     let asked = |row: &&Row| arguments.rows.is_empty() || arguments.rows.iter().any(|name| name == row.name);

@@ -1,6 +1,6 @@
-//! `corotate bridge`: a device behind a serial line, in a role's seat.
+//! `corotate bridge`: connects a device on a serial line to a run, as a role.
 
-use super::output::{Ended, Exit, Failure, fail, say};
+use super::output::{CommandResult, Exit, Failure, fail, say};
 use super::runs::join;
 use crate::launch::line_words;
 use crate::runtime::{DeviceConfig, DeviceError, NodeError};
@@ -12,25 +12,25 @@ use std::path::PathBuf;
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The device's serial line, as /dev/ttyUSB0 or a pty; set to raw mode, eight bits, no parity
+    /// Serial line, such as /dev/ttyUSB0; set to raw mode, eight bits, no parity
     #[arg(long, value_name = "PATH")]
     serial: PathBuf,
-    /// Its speed, bit/s [default: as it is]
+    /// Speed of the line, bit/s [default: unchanged]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(50..=20_000_000))]
     baud: Option<u32>,
-    /// The role whose seat the device takes: a driven body's name, observer, controller, or observer,controller
+    /// Role of the device: a driven body's name, observer, controller, or observer,controller
     #[arg(long, value_name = "NAME", value_delimiter = ',', required = true, alias = "body")]
     role: Vec<String>,
-    /// The run: its domain, as `corotate run --external NAME` prints it, or the directory that its results go to [default: the newest run of this user]
+    /// The run's domain or results directory; `run --external NAME` prints the domain [default: your newest run]
     #[arg(long, value_name = "DIR")]
     domain: Option<PathBuf>,
-    /// How long a device that is silent or gone is waited for, s
+    /// Wait this long for a silent or disconnected device, s
     #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = seconds)]
     patience: f64,
-    /// Go on if a device of another name answers in the midst of the run
+    /// Continue if a device of another name answers during the run
     #[arg(long)]
     allow_other_device: bool,
-    /// Print the line's counters at the end as one JSON object (corotate/bridge/v1)
+    /// Print the line's counters as one JSON object (corotate/bridge/v1)
     #[arg(long)]
     json: bool,
     /// Die with this process
@@ -52,10 +52,10 @@ fn seconds(text: &str) -> Result<f64, String> {
     sensible.then_some(value).ok_or_else(|| "give 0.001 to 86400 s".to_owned())
 }
 
-/// Serves the seat to the end of the run.
-pub fn bridge(arguments: &Arguments) -> Ended {
+/// Connects the device to the end of the run.
+pub fn bridge(arguments: &Arguments) -> CommandResult {
     let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
-    let seat = DeviceConfig {
+    let device = DeviceConfig {
         domain,
         roles: arguments.role.clone(),
         path: arguments.serial.clone(),
@@ -63,9 +63,9 @@ pub fn bridge(arguments: &Arguments) -> Ended {
         patience_s: arguments.patience,
         other_device: arguments.allow_other_device,
     };
-    let role = seat.roles.join(",");
-    let welcomed = |device: &str| tell(format_args!("{role} on {}: {device}", seat.path.display()));
-    let served = run_bridge(&seat, &terminated, welcomed).map_err(|error| fail(exit_of(&error), error))?;
+    let role = device.roles.join(",");
+    let welcomed = |name: &str| tell(format_args!("{role} on {}: {name}", device.path.display()));
+    let served = run_bridge(&device, &terminated, welcomed).map_err(|error| fail(exit_of(&error), error))?;
     let Some(BridgeResult { counters, outages, lost }) = served else { return Ok(Exit::Ok) };
     if arguments.json {
         let object = serde_json::json!({ "schema": SCHEMA, "role": role, "line": counters, "outages": outages });
@@ -81,10 +81,10 @@ fn exit_of(error: &RoleError) -> Exit {
         RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::NoDevice { .. } => {
             Exit::Usage
         }
-        // A device that should be there and does not answer is a failure; one that is not what was asked for is usage.
+        // A silent device is a failure; a wrong device is a usage error.
         RoleError::Device(DeviceError::Silent { .. }) => Exit::Failure,
         RoleError::Device(_) => Exit::Usage,
-        // It took part in the run, and is lost to it.
+        // Lost during the run.
         RoleError::Node(NodeError::Device(_)) => Exit::ProcessLost,
         _ => Exit::Failure,
     }

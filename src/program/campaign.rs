@@ -1,6 +1,6 @@
-//! Which campaign a command means, as `scenario` does for scenarios.
+//! Finds the campaign that the command line names, as `scenario` finds scenarios.
 //!
-//! Must not judge what it reads: [`crate::campaign`] does.
+//! Must not validate: [`crate::campaign`] does.
 
 use super::output::Failure;
 use super::scenario::{quoting, text, unknown};
@@ -10,7 +10,7 @@ use crate::config::{ConfigError, Document, is_name, nearest};
 use std::borrow::Cow;
 use std::path::Path;
 
-/// The campaign that is meant, with changes of its scenario.
+/// Loads a campaign, with overrides of its scenario.
 pub fn load(given: &Path, overrides: &[String]) -> Result<Campaign, Failure> {
     let (text, origin) = text(given, &|name| {
         let found = campaigns().iter().find(|(known, _)| *known == name);
@@ -24,7 +24,7 @@ pub fn load(given: &Path, overrides: &[String]) -> Result<Campaign, Failure> {
     campaign.map_err(|error| quoting(error, &origin, &text))
 }
 
-/// The scenario of a case.
+/// Returns the scenario of a case.
 pub fn case(campaign: &Campaign, number: u64) -> Result<Document, Failure> {
     let cases = campaign.cases();
     let case = campaign.case(number);
@@ -34,8 +34,8 @@ pub fn case(campaign: &Campaign, number: u64) -> Result<Document, Failure> {
     Ok(campaign.document(&case)?)
 }
 
-/// Whether a name or a file is a campaign's.
-pub fn is_meant(given: &Path) -> bool {
+/// Returns true if the name or file is that of a campaign.
+pub fn is_campaign_name(given: &Path) -> bool {
     match given.to_str().filter(|text| is_name(text)) {
         Some(name) => campaigns().iter().any(|(known, _)| *known == name),
         None => Document::read(given).is_ok_and(|document| is_campaign(&document)),
@@ -44,13 +44,14 @@ pub fn is_meant(given: &Path) -> bool {
 
 fn no_campaign(name: &str) -> ConfigError {
     if scenarios().iter().any(|(known, _)| *known == name) {
-        let text = format!("`{name}` is a scenario and no campaign; run it with `corotate run {name}`");
+        let text = format!("`{name}` is a scenario, not a campaign; run it with `corotate run {name}`");
         return ConfigError::Unknown { code: "is-scenario", text };
     }
     let known: Vec<&str> = campaigns().iter().map(|(name, _)| *name).collect();
     let remedy = nearest(name, &known);
     let end = if remedy.ends_with('?') { "" } else { "." };
-    let text =
-        format!("there is no campaign `{name}`; {remedy}{end} A file is given by its path, as ./{name} or {name}.toml");
+    let text = format!(
+        "there is no campaign `{name}`; {remedy}{end} Give a file by its path, such as ./{name} or {name}.toml"
+    );
     ConfigError::Unknown { code: "unknown-campaign", text }
 }

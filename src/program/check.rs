@@ -1,7 +1,7 @@
-//! `corotate check`: validate scenarios and tell what may be claimed of their loops.
+//! `corotate check`: validates scenarios and prints the claims about their loops.
 
 use super::campaign;
-use super::output::{Ended, Exit, Failure, fail, say};
+use super::output::{CommandResult, Exit, Failure, fail, say};
 use super::scenario::{Change, load};
 use crate::analysis::{Claim, Reach, apart, digits};
 use crate::campaign::Campaign;
@@ -15,34 +15,34 @@ use std::path::{Path, PathBuf};
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// Names of shipped scenarios or campaigns, files (x.toml, ./x), or - for stdin
+    /// Shipped scenarios or campaigns, files (x.toml, ./x), or - for stdin
     #[arg(required = true, value_name = "SCENARIO")]
     files: Vec<PathBuf>,
-    /// Override any key of the scenarios
+    /// Override a key of the scenarios
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Print each scenario with every default, its claims as comments: a scenario file again
+    /// Print each scenario with all defaults, and the claims as comments
     #[arg(long, conflicts_with = "json")]
     resolved: bool,
-    /// Print what is claimed of each scenario as one line of JSON (corotate/check/v1)
+    /// Print the claims about each scenario as a line of JSON (corotate/check/v1)
     #[arg(long)]
     json: bool,
 }
 
 const EXAMPLES: &str = "\
 Examples:
-  corotate check pair.toml         what may be claimed of its loop
+  corotate check pair.toml         the claims about its loop
   corotate check --resolved pair.toml > full.toml
-                                   the scenario with every default
-  corotate check --json pair.toml  those claims for programs
+                                   a scenario file with all defaults
+  corotate check --json pair.toml  the claims as JSON
   corotate check config/*.toml > /dev/null
-                                   are they all valid? exit code 2 if not";
+                                   exit code 2 unless all are valid";
 
-/// Checks scenarios; all of them, even if one fails.
-pub fn check(arguments: &Arguments) -> Ended {
+/// Checks all scenarios, even if one is invalid.
+pub fn check(arguments: &Arguments) -> CommandResult {
     let mut exit = Exit::Ok;
     for path in &arguments.files {
-        match checked(arguments, path) {
+        match check_file(arguments, path) {
             Ok(text) => drop(say(&text)?),
             Err(error) => exit = fail(Exit::Usage, error),
         }
@@ -50,24 +50,24 @@ pub fn check(arguments: &Arguments) -> Ended {
     Ok(exit)
 }
 
-/// What there is to say of a scenario, or of a campaign.
-fn checked(arguments: &Arguments, path: &Path) -> Result<String, Failure> {
-    if campaign::is_meant(path) {
+/// Validates a scenario or campaign and returns the text to print.
+fn check_file(arguments: &Arguments, path: &Path) -> Result<String, Failure> {
+    if campaign::is_campaign_name(path) {
         let campaign = campaign::load(path, &arguments.set)?;
         if arguments.json {
             return Ok(campaign_json(path, &campaign));
         }
-        let told = tell_campaign(path, &campaign);
-        return Ok(if arguments.resolved { resolved(&told, campaign.to_toml()) } else { told });
+        let text = campaign_text(path, &campaign);
+        return Ok(if arguments.resolved { resolved(&text, campaign.to_toml()) } else { text });
     }
     let scenario = load(Some(path), arguments.set.iter().map(|argument| Change::Set(argument)))?;
     check_cores(&scenario).map_err(|error| Failure::prefixed(path.display(), error))?;
     if arguments.json {
         return Ok(json(path, &scenario));
     }
-    let mut told = format!("{}: valid\n", path.display());
-    tell_claims(&scenario, &mut told).expect("a string takes every text");
-    Ok(if arguments.resolved { resolved(&told, &scenario.to_toml()) } else { told })
+    let mut text = format!("{}: valid\n", path.display());
+    write_claims(&scenario, &mut text).expect("writing to a string does not fail");
+    Ok(if arguments.resolved { resolved(&text, &scenario.to_toml()) } else { text })
 }
 
 fn campaign_json(path: &Path, campaign: &Campaign) -> String {
@@ -82,19 +82,19 @@ fn campaign_json(path: &Path, campaign: &Campaign) -> String {
     format!("{value}\n")
 }
 
-/// Returns the text as comments, then the resolved file: together a file of the same kind.
-fn resolved(told: &str, file: &str) -> String {
-    let comments: String = told.lines().map(|line| format!("# {line}\n")).collect();
+/// Returns the resolved file with the text as comments before it.
+fn resolved(text: &str, file: &str) -> String {
+    let comments: String = text.lines().map(|line| format!("# {line}\n")).collect();
     format!("{comments}{file}\n")
 }
 
-fn tell_campaign(path: &Path, campaign: &Campaign) -> String {
+fn campaign_text(path: &Path, campaign: &Campaign) -> String {
     let cases = campaign.cases();
     let words = if cases == 1 { "1 case".to_owned() } else { format!("{cases} cases") };
     format!("{}: valid, {words}, identity {}\n", path.display(), campaign.identity())
 }
 
-/// What is claimed of a scenario, for programs.
+/// Returns the claims about a scenario as JSON.
 fn json(path: &Path, scenario: &Scenario) -> String {
     let value = serde_json::json!({
         "schema": "corotate/check/v1",
@@ -110,20 +110,20 @@ fn json(path: &Path, scenario: &Scenario) -> String {
     format!("{value}\n")
 }
 
-/// Writes the loop's convergence first, then what weakens it, then the theorem behind it and the limits of the guards.
-fn tell_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
+/// Writes the convergence of the sampled loops, warnings and notes, then the theorems and the limits of the guards.
+fn write_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
     let claims = claims(scenario);
     if claims.is_empty() {
-        writeln!(text, "no body is driven, so no convergence rate is claimed")?;
+        writeln!(text, "no body is driven: no convergence rate is claimed")?;
     }
     let late = match scenario.actuation_delay_ticks {
         1 => "one tick".to_owned(),
         ticks => format!("{ticks} ticks"),
     };
-    claims.iter().try_for_each(|claim| tell_loop(claim, &late, text))?;
+    claims.iter().try_for_each(|claim| write_loop(claim, &late, text))?;
     scenario.warnings.iter().try_for_each(|warning| writeln!(text, "warning: {warning}"))?;
     scenario.notes().iter().try_for_each(|note| writeln!(text, "note: {note}"))?;
-    claims.iter().try_for_each(|claim| tell_theorem(claim, text))?;
+    claims.iter().try_for_each(|claim| write_theorem(claim, text))?;
     let limits = scenario.rig.limits();
     if !limits.is_empty() {
         writeln!(text, "limits of the guards")?;
@@ -131,12 +131,12 @@ fn tell_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
     limits.iter().try_for_each(|limit| writeln!(text, "  {}: {}", limit.name, digits(limit.value)))
 }
 
-/// Writes the convergence of the loop that runs.
-fn tell_loop(claim: &Claim, late: &str, text: &mut String) -> std::fmt::Result {
+/// Writes the convergence of the sampled loop.
+fn write_loop(claim: &Claim, late: &str, text: &mut String) -> std::fmt::Result {
     match (claim.loop_rate_text(), claim.over_s, &claim.reason) {
         (Some(rate), Some(over_s), _) => {
             writeln!(text, "{}: a small error falls as exp(-{rate} t)", claim.body)?;
-            writeln!(text, "  in the sampled loop, {late} late; computed over the first {} s", digits(over_s))?;
+            writeln!(text, "  sampled loop, commands {late} late; computed over the first {} s", digits(over_s))?;
         }
         (_, _, reason) => {
             writeln!(text, "{}: no rate is claimed: {}", claim.body, reason.as_deref().unwrap_or_default())?;
@@ -150,17 +150,17 @@ fn tell_loop(claim: &Claim, late: &str, text: &mut String) -> std::fmt::Result {
         });
         writeln!(text, "  {}: {fall}floor {}", floor.name, digits(floor.value))?;
     }
-    // The reason why no rate is claimed is a warning too, and is written above.
-    let mut others = claim.warnings.iter().filter(|warning| claim.reason.as_ref() != Some(*warning));
-    others.try_for_each(|warning| writeln!(text, "  warning: {warning}"))
+    // The reason for claiming no rate is also a warning; it is written above.
+    let mut rest = claim.warnings.iter().filter(|warning| claim.reason.as_ref() != Some(*warning));
+    rest.try_for_each(|warning| writeln!(text, "  warning: {warning}"))
 }
 
-/// Writes what is proven of the law in continuous time.
-fn tell_theorem(claim: &Claim, text: &mut String) -> std::fmt::Result {
+/// Writes the theorem about the law in continuous time.
+fn write_theorem(claim: &Claim, text: &mut String) -> std::fmt::Result {
     writeln!(text, "{}, the law in continuous time", claim.body)?;
     match claim.continuous_rate_per_s {
         Some(rate) => writeln!(text, "  the error falls at least as exp(-{} t)", digits(rate))?,
-        None if claim.conditions.is_empty() => writeln!(text, "  the rig has no theorem for it")?,
+        None if claim.conditions.is_empty() => writeln!(text, "  no theorem: the rig has none for this law")?,
         None => writeln!(text, "  no constant rate: the observer's gain varies")?,
     }
     for condition in &claim.conditions {

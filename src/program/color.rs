@@ -1,9 +1,9 @@
-//! Colour on a terminal, where its reader wants any.
+//! Colours on terminals.
 
 use std::io::IsTerminal;
 use std::sync::OnceLock;
 
-/// When to colour what is printed; `Auto` is on a terminal, unless NO_COLOR is set or TERM is dumb.
+/// Condition for colours; `Auto`: on terminals, unless NO_COLOR is set or TERM is dumb.
 #[derive(Clone, Copy, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum When {
     #[default]
@@ -12,7 +12,7 @@ pub enum When {
     Never,
 }
 
-/// A colour, by the number that sets it on a terminal.
+/// A colour, with its ANSI code.
 #[derive(Clone, Copy)]
 pub enum Color {
     Red = 31,
@@ -22,12 +22,12 @@ pub enum Color {
 
 static WHEN: OnceLock<When> = OnceLock::new();
 
-/// Says when to colour. The first word counts.
+/// Sets the condition for colours. Later calls have no effect.
 pub fn choose(when: When) {
     let _ = WHEN.set(when);
 }
 
-/// A word for a stream, in bold and in a colour if that is wanted there.
+/// Returns the word, bold and coloured if the condition holds for the stream.
 pub fn paint(word: &str, color: Color, stream: &impl IsTerminal) -> String {
     let set = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty());
     let wanted = match WHEN.get().copied().unwrap_or_default() {

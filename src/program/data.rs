@@ -1,40 +1,40 @@
-//! What `identify` and `estimate` share: how a log is named, read and told of.
+//! Options and output that `identify` and `estimate` share for logs.
 
 use super::output::Exit;
 use crate::data::{DataError, LogAccount, Options, RateUnit, TimeUnit};
 use std::fmt::Write;
 
-/// How a log is to be read.
+/// Options for reading a log.
 #[derive(clap::Args)]
 pub struct LogArguments {
-    /// The topic of an MCAP file, or the end of its name [default: the only one with an angular velocity]
+    /// Topic in an MCAP file, or the end of its name [default: the only one with an angular velocity]
     #[arg(long, value_name = "TOPIC", hide_short_help = true)]
     topic: Option<String>,
-    /// The column of time stamps [default: the one that is called so]
+    /// Column of time stamps [default: found by its name]
     #[arg(long, value_name = "NAME", hide_short_help = true)]
     time: Option<String>,
-    /// The columns of the rates about x, y and z; a - for one that is not there [default: those that are called so]
+    /// Columns of the rates about x, y and z; - if absent [default: found by name]
     #[arg(long, value_name = "X,Y,Z", value_parser = three_names)]
     rates: Option<Names>,
-    /// The unit of the stamps: s, ms, us or ns [default: what the column's name says, else s]
+    /// Unit of the time stamps: s, ms, us or ns [default: from the column's name, else s]
     #[arg(long, value_name = "UNIT", value_parser = time_unit, hide_short_help = true)]
     time_unit: Option<TimeUnit>,
-    /// The unit of the rates: rad/s or deg/s [default: what the columns' names say, else rad/s]
+    /// Unit of the rates: rad/s or deg/s [default: from the columns' names, else rad/s]
     #[arg(long, value_name = "UNIT", value_parser = rate_unit, hide_short_help = true)]
     rate_unit: Option<RateUnit>,
-    /// A new value in this column begins a new segment: another throw, another run
+    /// Begin a new segment when the value in this column changes
     #[arg(long, value_name = "NAME")]
     by: Option<String>,
-    /// A longer pause begins a new segment, s [default: 5 usual intervals]
+    /// Begin a new segment after a longer pause, s [default: 5 usual intervals]
     #[arg(long, value_name = "S", allow_negative_numbers = true, hide_short_help = true)]
     gap: Option<f64>,
-    /// The first row has no names; columns are then named by number, from 1
+    /// The first row is data; name columns by number, from 1
     #[arg(long, hide_short_help = true)]
     no_header: bool,
 }
 
 impl LogArguments {
-    /// The same for the reader.
+    /// Returns the options for the reader.
     pub fn options(&self) -> Options {
         Options {
             topic: self.topic.clone(),
@@ -58,15 +58,15 @@ fn three_names(text: &str) -> Result<Names, String> {
     let names: Vec<String> = text.split(',').map(|name| name.trim().to_owned()).collect();
     <[String; 3]>::try_from(names)
         .map(Names)
-        .map_err(|_| "give three names with commas between, as wx,wy,wz".to_owned())
+        .map_err(|_| "give three names separated by commas, such as wx,wy,wz".to_owned())
 }
 
-/// So many numbers with commas between, as an option has them.
+/// Parses `N` numbers separated by commas.
 pub fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
     let parsed: Result<Vec<f64>, _> = text.split(',').map(|number| number.trim().parse::<f64>()).collect();
     let numbers = parsed.ok().and_then(|numbers| <[f64; N]>::try_from(numbers).ok());
     let finite = numbers.filter(|numbers| numbers.iter().all(|number| number.is_finite()));
-    finite.ok_or_else(|| format!("give {N} finite numbers with commas between"))
+    finite.ok_or_else(|| format!("give {N} finite numbers separated by commas"))
 }
 
 fn time_unit(name: &str) -> Result<TimeUnit, String> {
@@ -77,7 +77,7 @@ fn rate_unit(name: &str) -> Result<RateUnit, String> {
     RateUnit::parse(name).ok_or_else(|| "the units of rates are rad/s and deg/s".to_owned())
 }
 
-/// An axis by its letter or its number, 1 to 3.
+/// Parses an axis, a letter or a number from 1 to 3.
 pub fn axis(name: &str) -> Result<usize, String> {
     match name {
         "x" | "1" => Ok(1),
@@ -90,7 +90,7 @@ pub fn axis(name: &str) -> Result<usize, String> {
 /// The letters of the axes.
 pub const AXES: [&str; 3] = ["x", "y", "z"];
 
-/// The exit code of a log that cannot be read: what is in it, or how it was named, is the user's to mend.
+/// Returns the exit code for a log that cannot be read: `Usage` if the user can correct its name or contents.
 pub fn exit_of(error: &DataError) -> Exit {
     match error {
         DataError::Read { source, .. } if source.kind() != std::io::ErrorKind::NotFound => Exit::Failure,
@@ -98,8 +98,8 @@ pub fn exit_of(error: &DataError) -> Exit {
     }
 }
 
-/// What was read, and what was not.
-pub fn tell_log(log: &LogAccount, text: &mut String) -> std::fmt::Result {
+/// Writes the columns, units and counts of rows of a log.
+pub fn write_log(log: &LogAccount, text: &mut String) -> std::fmt::Result {
     let (meaning, counts) = (&log.meaning, &log.counts);
     writeln!(text, "{}: {} of {} rows, {} segments", log.path.display(), counts.used, counts.rows, counts.segments)?;
     let assumed = |what: &str| if meaning.assumed.contains(&what) { " (assumed)" } else { "" };
@@ -111,10 +111,10 @@ pub fn tell_log(log: &LogAccount, text: &mut String) -> std::fmt::Result {
         writeln!(text, "  intervals of {shortest:.6} to {longest:.6} s")?;
     }
     for (count, what) in [
-        (counts.incomplete, "rows without a value that is needed, left out"),
-        (counts.repeated, "rows with the stamp of the row before, left out"),
-        (counts.backward, "steps back in time, each the begin of a segment"),
-        (counts.gaps, "pauses, each the begin of a segment"),
+        (counts.incomplete, "rows without a needed value, left out"),
+        (counts.repeated, "rows that repeat the stamp of the row before, left out"),
+        (counts.backward, "steps back in time, each begins a segment"),
+        (counts.gaps, "pauses, each begins a segment"),
     ] {
         if count > 0 {
             writeln!(text, "  {count} {what}")?;
@@ -123,7 +123,7 @@ pub fn tell_log(log: &LogAccount, text: &mut String) -> std::fmt::Result {
     Ok(())
 }
 
-/// The same for programs.
+/// Returns the same facts as JSON.
 pub fn log_json(log: &LogAccount) -> serde_json::Value {
     serde_json::json!({
         "file": log.path.display().to_string(),

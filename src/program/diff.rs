@@ -1,6 +1,6 @@
-//! `corotate diff`: two recordings beside each other.
+//! `corotate diff`: compares two recordings.
 
-use super::output::{Ended, Exit, Failure, fail, harmless, remark, say};
+use super::output::{CommandResult, Exit, Failure, fail, harmless, remark, say};
 use super::record::{exit_of, exit_with, open};
 use super::runs;
 use crate::record::{Comparison, SignalDiff, Tolerances, ValueDiff, diff as compare};
@@ -13,15 +13,15 @@ use std::path::PathBuf;
 pub struct Arguments {
     /// A run's directory, a recording, or latest
     a: PathBuf,
-    /// Another [default: the newest other recording in runs/]
+    /// The second [default: the newest other recording in runs/]
     b: Option<PathBuf>,
-    /// So much may numbers differ, in the field's own unit
+    /// Absolute tolerance, in the field's unit
     #[arg(long, value_name = "X", default_value_t = 0.0)]
     absolute: f64,
-    /// So much may numbers differ, as a part of the larger one
+    /// Relative tolerance, as a part of the larger number
     #[arg(long, value_name = "X", default_value_t = 0.0)]
     relative: f64,
-    /// Go on with what there is of a recording that is not complete
+    /// Accept incomplete recordings
     #[arg(long)]
     accept_incomplete: bool,
     /// Print one JSON object on stdout (corotate/diff/v1)
@@ -33,22 +33,25 @@ pub struct Arguments {
 const SCHEMA: &str = "corotate/diff/v1";
 
 const EXAMPLES: &str = "\
-Values are compared at ticks that both recordings have; times and generations
-are not. Exit code 3 if they differ.
+Compares all values at ticks that both recordings have, except times and
+generations. Exit code 3 if they differ.
 
 Examples:
-  corotate diff runs/before        that run and the newest one, bit for bit
+  corotate diff runs/before        with the newest other recording, bit for bit
   corotate diff a/run.mcap b/run.mcap --absolute 1e-9
                                    numbers within 1e-9 rad/s, rad/s2, ...";
 
-/// Compares.
-pub fn diff(arguments: &Arguments) -> Ended {
+/// Executes `corotate diff`.
+pub fn diff(arguments: &Arguments) -> CommandResult {
     let tolerances = Tolerances { absolute: arguments.absolute, relative: arguments.relative };
     let bad = [("absolute", arguments.absolute), ("relative", arguments.relative)]
         .into_iter()
         .find(|(_, x)| !(0.0..).contains(x));
     if let Some((name, value)) = bad {
-        return Err(fail(Exit::Usage, Failure::new("negative", format!("--{name} {value}: a tolerance is 0 or more"))));
+        return Err(fail(
+            Exit::Usage,
+            Failure::new("negative", format!("--{name} {value}: invalid tolerance; give 0 or more")),
+        ));
     }
     let files = files(arguments).map_err(|failure| fail(Exit::Usage, failure))?;
     let failed = |error| fail(exit_of(&error), error);
@@ -61,7 +64,7 @@ pub fn diff(arguments: &Arguments) -> Ended {
     Ok(exit_with(&a, exit_with(&b, exit)))
 }
 
-/// The two recordings. Without a second name it is the newest other recording in `runs/`.
+/// Returns the two recordings. The second defaults to the newest other recording in `runs/`.
 fn files(arguments: &Arguments) -> Result<[PathBuf; 2], Failure> {
     let a = runs::recording(Some(&arguments.a))?;
     if arguments.b.is_some() {
@@ -73,7 +76,7 @@ fn files(arguments: &Arguments) -> Result<[PathBuf; 2], Failure> {
     Ok([a, b])
 }
 
-/// All of it for programs. A number that is not finite is null.
+/// Returns the comparison as JSON. A number that is not finite is null.
 fn json(files: &[PathBuf; 2], comparison: &Comparison) -> String {
     let value = |first: &ValueDiff| serde_json::json!({ "tick": first.tick, "field": first.field, "a": first.values[0], "b": first.values[1] });
     let signal = |signal: &SignalDiff| {

@@ -1,7 +1,7 @@
-//! `corotate doctor`: is this machine fit for real time, and what to do about it.
+//! `corotate doctor`: checks whether this machine is fit for real time, and prints remedies.
 
 use super::hosts::{self, KeyArguments};
-use super::output::{Ended, Exit, Failure, fail, say};
+use super::output::{CommandResult, Exit, Failure, fail, say};
 use super::scenario::{Change, load};
 use super::signals::catch_signals;
 use crate::bus::domain::{DomainError, domains, remove_dead_domains, scan_abandoned};
@@ -15,15 +15,15 @@ use std::path::{Path, PathBuf};
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The scenario that the machine is to be fit for; without one, the first that ships with the program
+    /// Scenario that the machine must run [default: the program's first]
     file: Option<PathBuf>,
-    /// How long to run the scenario in real time, s; 0 leaves it out
+    /// Duration of the test run in real time, s; 0 skips it
     #[arg(long, value_name = "S", default_value_t = 10, value_parser = clap::value_parser!(u32).range(0..=86_400))]
     seconds: u32,
-    /// Remove what dead runs of this user left behind
+    /// Remove the files of your dead runs
     #[arg(long)]
     clean: bool,
-    /// Examine the way to where a run waits for hosts to join, for so many seconds, and nothing else
+    /// Only measure the link to a run that waits for hosts, for --seconds
     #[arg(long, value_name = "ADDR")]
     link: Option<Address>,
     #[command(flatten)]
@@ -34,33 +34,33 @@ pub struct Arguments {
 }
 
 const EXAMPLES: &str = "\
-Exit codes: 0 no line is bad, 3 not fit: some line is bad
+Exit codes: 0 fit: no line is bad; 3 not fit: a line is bad
 
-The scenario runs in a domain of its own: every role at its core, priority and
-rate, without faults, criteria and results; external roles are ours.
+The test run keeps cores, priorities and rate of the scenario, but has no
+faults, no criteria and no results; it starts external roles itself.
 
 Examples:
-  corotate doctor                  every line with what to do about it, after
-                                   ten seconds of ticks
+  corotate doctor                  all checks with remedies, and a test run of
+                                   ten seconds
   corotate doctor fast.toml --seconds 60
-                                   for that scenario's roles, rate and cores,
-                                   measured for a minute
+                                   for another scenario, with a test run of a
+                                   minute
   corotate doctor --link tcp/127.0.0.1:7447
-                                   the clock of the host that launches, and how
-                                   long messages take to it and back
-  corotate doctor --clean --json   remove what dead runs left; for programs";
+                                   clock offset and round-trip times to the
+                                   launching host
+  corotate doctor --clean --json   remove files of dead runs; print JSON";
 
 /// Examines the machine.
-pub fn doctor(arguments: &Arguments) -> Ended {
+pub fn doctor(arguments: &Arguments) -> CommandResult {
     if let Some(address) = &arguments.link {
         return hosts::probe(address, &arguments.keys, f64::from(arguments.seconds), arguments.json);
     }
     let scenario = load(arguments.file.as_deref(), []).map_err(|error| fail(Exit::Usage, error))?;
-    // If it cannot be done, the line on what is left says why.
+    // A failure appears in the line on leftovers.
     let cleared = if arguments.clean { remove_dead_domains().map_err(DomainError::from) } else { Ok(Vec::new()) };
-    let demand = Demand::of(&scenario);
+    let demand = Demand::new(&scenario);
     let mut checks = Machine::at(Path::new("/")).examine(&demand);
-    // The line on the limit tells it where the limit forbids it.
+    // Not repeated if the line on the limit reports it.
     if !checks.iter().any(|check| check.name == "rtprio limit" && check.verdict == Verdict::Bad) {
         checks.extend(refused(demand.priority));
     }
@@ -71,8 +71,8 @@ pub fn doctor(arguments: &Arguments) -> Ended {
     checks.extend(left_in_shared_memory(scan_abandoned(false)));
     let trial = match (arguments.seconds > 0).then(|| attempt(arguments)).transpose() {
         Ok(trial) => trial,
-        Err(Unmeasured::Exit(exit)) => return Err(exit),
-        Err(Unmeasured::Failed(check)) => {
+        Err(TrialError::Exit(exit)) => return Err(exit),
+        Err(TrialError::Failed(check)) => {
             checks.push(check);
             None
         }
@@ -82,23 +82,23 @@ pub fn doctor(arguments: &Arguments) -> Ended {
     say(&text).map(|exit| if diagnosis.fit == Some(false) { Exit::NotAccepted } else { exit })
 }
 
-/// Why there is no measurement.
-enum Unmeasured {
-    /// The run failed, and the line says why.
+/// The reason why there is no measurement.
+enum TrialError {
+    /// The run failed; the line contains the reason.
     Failed(Check),
-    /// It was not to be: the error is told.
+    /// The command must end; its reason is printed.
     Exit(Exit),
 }
 
-/// Runs the scenario for some seconds, with its progress on a terminal.
-fn attempt(arguments: &Arguments) -> Result<Trial, Unmeasured> {
+/// Runs the scenario for `--seconds`, with a progress bar on a terminal.
+fn attempt(arguments: &Arguments) -> Result<Trial, TrialError> {
     let duration = format!("duration_s={}", arguments.seconds);
-    // Nothing of the run is to go wrong by the script, nor to wait for somebody else.
+    // Without injected faults, and without roles that the run would wait for.
     let overrides =
         ["clock=realtime", &duration, "accept={}", "fault=[]", "watchdog={}", "launch.external=[]", "host=[]"];
     let scenario = load(arguments.file.as_deref(), overrides.map(Change::Set))
-        .map_err(|error| Unmeasured::Failed(Trial::failed(error.to_string())))?;
-    let signal = catch_signals().map_err(|error| Unmeasured::Exit(fail(Exit::Failure, error)))?;
+        .map_err(|error| TrialError::Failed(Trial::failed(error.to_string())))?;
+    let signal = catch_signals().map_err(|error| TrialError::Exit(fail(Exit::Failure, error)))?;
     let style = ProgressStyle::with_template("{bar:40} running in real time, {eta} left");
     let bar = ProgressBar::new(scenario.last_tick).with_style(style.expect("the template is a constant that parses"));
     let mut show = |progress: &Progress<'_>| {
@@ -108,12 +108,12 @@ fn attempt(arguments: &Arguments) -> Result<Trial, Unmeasured> {
     };
     let outcome = run(&scenario, &mut Launch::new(&signal, &mut show));
     bar.finish_and_clear();
-    let outcome = outcome.map_err(|error| Unmeasured::Failed(Trial::failed(Failure::from(error).to_string())))?;
+    let outcome = outcome.map_err(|error| TrialError::Failed(Trial::failed(Failure::from(error).to_string())))?;
     if outcome.signal != 0 {
-        return Err(Unmeasured::Exit(Exit::Signal(outcome.signal)));
+        return Err(TrialError::Exit(Exit::Signal(outcome.signal)));
     }
     if let Some(incident) = outcome.incidents.first() {
-        return Err(Unmeasured::Failed(Trial::failed(incident.to_string())));
+        return Err(TrialError::Failed(Trial::failed(incident.to_string())));
     }
     let tick_hz = 1e9 / scenario.period_ns as f64;
     Ok(Trial::new(tick_hz, scenario.last_tick + 1, &outcome.reports, &outcome.grants))

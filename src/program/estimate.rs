@@ -1,7 +1,7 @@
-//! `corotate estimate`: the rate about one axis of a body from a log of the other two.
+//! `corotate estimate`: estimates the rate about one axis of a body from a log of the other two.
 
-use super::data::{AXES, LogArguments, axis, exit_of, log_json, numbers, tell_log};
-use super::output::{Ended, Exit, Failure, fail, harmless, say};
+use super::data::{AXES, LogArguments, axis, exit_of, log_json, numbers, write_log};
+use super::output::{CommandResult, Exit, Failure, fail, harmless, say};
 use crate::data::{EstimateError, Estimated, Estimation, FilterOrder, Request, estimate_log};
 use crate::estimate::{FilterKind, SegmentScore};
 use crate::files;
@@ -18,54 +18,54 @@ use std::io::{self, BufWriter, Write};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-/// So many rows of a Parquet table wait for their group.
+/// Number of rows per group of a Parquet table.
 #[cfg(feature = "parquet")]
 const ROWS_PER_GROUP: usize = 1 << 17;
-/// So many segments are listed one by one.
+/// The largest number of segments that are listed individually.
 const LISTED: usize = 12;
 
 /// Options of `corotate estimate`.
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The log: CSV, MCAP or Parquet; - is CSV from the standard input
+    /// Log: CSV, MCAP or Parquet; - for CSV from stdin
     data: PathBuf,
     #[command(flatten)]
     log: LogArguments,
-    /// The axis whose rate is not to be read: x, y or z. Where the log has it, it is used for the score alone
+    /// Axis of the estimated rate: x, y or z; its column, if any, serves only the score
     #[arg(long, value_name = "AXIS", value_parser = axis)]
     hidden: usize,
-    /// The body: what `corotate identify --json` printed
+    /// Body: a file with the output of `corotate identify --json`
     #[arg(long, value_name = "FILE", conflicts_with = "inertia", required_unless_present = "inertia")]
     body: Option<PathBuf>,
-    /// The body: its principal moments of inertia, kg m2 or any other unit
+    /// Body: its principal moments of inertia, in any unit
     #[arg(long, value_name = "X,Y,Z", value_parser = three)]
     inertia: Option<Vector3<f64>>,
-    /// Damping by the air, a torque -c I w, 1/s [default: the body's, else 0]
+    /// Air damping c of the torque -c I w, 1/s [default: the body's, else 0]
     #[arg(long, value_name = "C", allow_negative_numbers = true, hide_short_help = true)]
     damping: Option<f64>,
-    /// The principal axes in the sensor's axes, row by row; the axes are columns [default: the body's, else the sensor's]
+    /// Principal axes in sensor axes: a matrix row by row, axes in columns [default: the body's, else the sensor's]
     #[arg(long, value_name = "NINE", value_parser = nine, allow_hyphen_values = true, hide_short_help = true)]
     axes: Option<Matrix3<f64>>,
-    /// The filter
+    /// Filter
     #[arg(long, value_enum, default_value_t = Order::First, hide_short_help = true)]
     filter: Order,
-    /// Its rate, 1/s: how fast errors of the estimate decay [default: chosen from noise and motion, and said]
+    /// Decay rate of the estimate's errors, 1/s [default: chosen from noise and motion]
     #[arg(long, value_name = "RATE", allow_negative_numbers = true)]
     decay: Option<f64>,
-    /// Standard deviation of one measured rate for the Kalman filter, rad/s [default: that of the log]
+    /// Standard deviation of a measured rate for the Kalman filter, rad/s [default: estimated from the log]
     #[arg(long, value_name = "RAD/S", allow_negative_numbers = true, hide_short_help = true)]
     noise: Option<f64>,
-    /// The first estimate of every segment, rad/s [default: what the first step tells]
+    /// First estimate of every segment, rad/s [default: from the first step]
     #[arg(long, value_name = "RAD/S", allow_negative_numbers = true, hide_short_help = true)]
     guess: Option<f64>,
-    /// Below this the measured rates tell nothing of the hidden one, rad/s [default: 10 times their noise]
+    /// Measured rates below this do not determine the hidden one, rad/s [default: 10 times their noise]
     #[arg(long, value_name = "RAD/S", allow_negative_numbers = true, hide_short_help = true)]
     floor: Option<f64>,
-    /// Write every row with its estimate to this file: Parquet if its name ends so, else CSV
+    /// Write every row with its estimate: Parquet if the name ends in .parquet, else CSV
     #[arg(long, value_name = "FILE")]
     table: Option<PathBuf>,
-    /// Draw reconstructed and measured rate on this page
+    /// Write a page with charts of estimated and measured rate (HTML)
     #[arg(long, value_name = "FILE")]
     page: Option<PathBuf>,
     /// Print one line of JSON (corotate/estimate/v1)
@@ -76,22 +76,25 @@ pub struct Arguments {
 /// The filters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum Order {
-    /// The papers': errors fall exponentially
+    /// First order, as in the papers: errors decay exponentially
     First,
-    /// Two poles: less noise passes
+    /// Second order: passes less noise
     Second,
-    /// Gains that weigh each step by its noise
+    /// Kalman: gains follow the noise of each step
     Kalman,
 }
 
 const EXAMPLES: &str = "\
-The score is the root mean square of estimate less measured over the second half of every segment, where the log has the hidden
-rate. Steps that tell nothing of it are counted; the model goes on alone there.
+The score is the rms error over the second half of every segment, if the log has
+the hidden rate. Steps that do not determine it are counted; the estimate then
+follows the model.
 
 Examples:
   corotate identify throws.csv --by throw --json > body.json
-  corotate estimate throws.csv --by throw --hidden z --body body.json --table z.csv --page z.html
-  corotate estimate gyro.csv --rates wx,wy,- --hidden z --inertia 1,2,2.5        the log has no such column
+  corotate estimate throws.csv --by throw --hidden z --body body.json \\
+           --table z.csv --page z.html
+  corotate estimate gyro.csv --rates wx,wy,- --hidden z --inertia 1,2,2.5
+                                   a log without the hidden rate
   corotate estimate gyro.csv --hidden y --body body.json --filter kalman";
 
 fn three(text: &str) -> Result<Vector3<f64>, String> {
@@ -102,15 +105,15 @@ fn nine(text: &str) -> Result<Matrix3<f64>, String> {
     numbers::<9>(text).map(|numbers| Matrix3::from_row_slice(&numbers))
 }
 
-/// What is known of a body.
+/// Properties of a body.
 struct Body {
     moments: Vector3<f64>,
     damping_per_s: f64,
     axes: Option<Matrix3<f64>>,
 }
 
-/// Estimates.
-pub fn estimate(arguments: &Arguments) -> Ended {
+/// Executes `corotate estimate`.
+pub fn estimate(arguments: &Arguments) -> CommandResult {
     let body = body(arguments).map_err(|failure| fail(Exit::Usage, failure))?;
     let inertia = Inertia::new(body.moments.into());
     let inertia = inertia.map_err(|error| fail(Exit::Usage, Failure::prefixed("the inertia", error)))?;
@@ -131,11 +134,11 @@ pub fn estimate(arguments: &Arguments) -> Ended {
     };
     let outputs = [&arguments.table, &arguments.page];
     if let Some(path) = outputs.into_iter().flatten().find(|path| is_same(path, &arguments.data)) {
-        let reason = format!("{}: that is the log; name another file to write to", path.display());
+        let reason = format!("cannot write {}: it is the log; name another file", path.display());
         return Err(fail(Exit::Usage, Failure::new("same-file", reason)));
     }
     if cfg!(not(feature = "parquet")) && arguments.table.as_deref().is_some_and(is_parquet) {
-        let reason = "--table: this program writes no Parquet; build it with `--features parquet`";
+        let reason = "--table: this program was built without Parquet; build it with `--features parquet`";
         return Err(fail(Exit::Usage, Failure::new("built-without", reason)));
     }
     let unwritten = |path: &Option<PathBuf>, error: io::Error| {
@@ -148,8 +151,8 @@ pub fn estimate(arguments: &Arguments) -> Ended {
     let mut table = table.map_err(|error| unwritten(&arguments.table, error))?;
     let done = estimate_log(&arguments.data, &arguments.log.options(), &request, |row, segment| {
         if let Some(page) = &mut page {
-            let (told, measured) = (&row.told, row.principal_rad_s[request.axis - 1]);
-            page.push(row.entry.begins, row.entry.time_s, told.rate_rad_s, measured, told.observed);
+            let (estimate, measured) = (&row.estimate, row.principal_rad_s[request.axis - 1]);
+            page.push(row.entry.begins, row.entry.time_s, estimate.rate_rad_s, measured, estimate.observed);
         }
         table.as_mut().map_or(Ok(()), |table| table.row(row, segment, request.axis))
     });
@@ -158,12 +161,12 @@ pub fn estimate(arguments: &Arguments) -> Ended {
         error => fail(exit(&error), error),
     })?;
     table.map_or(Ok(()), Table::end).map_err(|error| unwritten(&arguments.table, error))?;
-    let told = tell(&request, &estimation);
+    let results = results_text(&request, &estimation);
     if let (Some(page), Some(path)) = (page, &arguments.page) {
         let facts = HiddenFacts {
             title: arguments.data.display().to_string(),
             axis: AXES[request.axis - 1],
-            paragraphs: told.split("\n\n").map(paragraph).collect(),
+            paragraphs: results.split("\n\n").map(paragraph).collect(),
             segments: &estimation.segments,
         };
         let written = files::write(path, page.html(&facts).as_bytes());
@@ -173,7 +176,7 @@ pub fn estimate(arguments: &Arguments) -> Ended {
         true => format!("{}\n", to_json(&request, &estimation)),
         false => {
             let files = [&arguments.table, &arguments.page].into_iter().flatten();
-            files.fold(harmless(&told), |text, path| format!("{text}{}\n", path.display()))
+            files.fold(harmless(&results), |text, path| format!("{text}{}\n", path.display()))
         }
     };
     say(&text)
@@ -189,28 +192,28 @@ fn exit(error: &EstimateError) -> Exit {
     }
 }
 
-/// Whether two paths lead to one file.
-fn is_same(one: &Path, other: &Path) -> bool {
+/// Returns true if both paths lead to the same file.
+fn is_same(a: &Path, b: &Path) -> bool {
     let identity = |path: &Path| std::fs::metadata(path).ok().map(|about| (about.dev(), about.ino()));
-    identity(one).is_some_and(|one| Some(one) == identity(other))
+    identity(a).is_some_and(|file| Some(file) == identity(b))
 }
 
-/// The body as it was given.
+/// Returns the body given by the options.
 fn body(arguments: &Arguments) -> Result<Body, Failure> {
     let Some(path) = &arguments.body else {
         let moments = arguments.inertia.unwrap_or_else(Vector3::zeros);
         return Ok(Body { moments, damping_per_s: 0.0, axes: None });
     };
     let text = std::fs::read_to_string(path)
-        .map_err(|error| format!("cannot read {}: {error}; name a file that can be read", path.display()))
+        .map_err(|error| format!("cannot read {}: {error}; name a readable file", path.display()))
         .map_err(|reason| Failure::new("cannot-read", reason))?;
     read_body(&text).map_err(|(code, reason)| {
-        let remedy = "give what `corotate identify --json` printed";
+        let remedy = "give the output of `corotate identify --json`";
         Failure::new(code, format!("{}: {reason}; {remedy}", path.display()))
     })
 }
 
-/// The body in what `identify` printed.
+/// Parses the output of `identify`.
 fn read_body(text: &str) -> Result<Body, (&'static str, String)> {
     #[derive(serde::Deserialize)]
     struct Found {
@@ -233,7 +236,7 @@ fn read_body(text: &str) -> Result<Body, (&'static str, String)> {
     Ok(Body { moments: found.inertia_kg_m2.into(), damping_per_s: found.damping_per_s, axes })
 }
 
-/// What tables have beside the segment's name.
+/// Columns of tables, after the segment's name.
 const COLUMNS: [(&str, FieldKind); 7] = [
     ("row", FieldKind::U64),
     ("time_s", FieldKind::F64),
@@ -244,7 +247,7 @@ const COLUMNS: [(&str, FieldKind); 7] = [
     ("observed", FieldKind::U64),
 ];
 
-/// Every row with its estimate.
+/// A writer of rows with estimates.
 enum Table {
     Csv(BufWriter<files::Created>),
     #[cfg(feature = "parquet")]
@@ -271,7 +274,7 @@ impl Table {
             .map(|groups| Self::Parquet(Box::new(groups)))
     }
 
-    /// Refused before anything is read.
+    /// Fails: built without Parquet.
     #[cfg(not(feature = "parquet"))]
     fn begin_parquet(_path: &Path) -> io::Result<Self> {
         Err(io::ErrorKind::Unsupported.into())
@@ -281,12 +284,12 @@ impl Table {
         let measured = row.principal_rad_s[axis - 1];
         let numbers = [
             row.entry.time_s,
-            row.told.rate_rad_s,
-            row.told.deviation_rad_s.unwrap_or(f64::NAN),
+            row.estimate.rate_rad_s,
+            row.estimate.deviation_rad_s.unwrap_or(f64::NAN),
             measured,
-            row.told.rate_rad_s - measured,
+            row.estimate.rate_rad_s - measured,
         ];
-        let observed = u64::from(row.told.observed);
+        let observed = u64::from(row.estimate.observed);
         match self {
             Self::Csv(out) => {
                 write!(out, "{},{}", quoted(segment), row.entry.row)?;
@@ -313,22 +316,22 @@ impl Table {
     }
 }
 
-/// Whether a table of this name is one as Parquet.
+/// Returns true if the table's name ends in .parquet.
 fn is_parquet(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("parquet"))
 }
 
-/// A name as a cell.
+/// Returns a name as a cell of CSV.
 fn quoted(name: &str) -> String {
     if name.contains([',', '"', '\n', '\r']) { format!("\"{}\"", name.replace('"', "\"\"")) } else { name.to_owned() }
 }
 
-/// Median and 90th percentile of what is finite; none of nothing.
+/// Returns median and 90th percentile of the finite values; `None` without any.
 fn percentiles(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
     let mut sorted: Vec<f64> = values.filter(|value| value.is_finite()).collect();
     sorted.sort_by(f64::total_cmp);
     let last = sorted.len().checked_sub(1)?;
-    // Between neighbours in proportion.
+    // Linear interpolation between neighbours.
     let at = |part: f64| {
         let place = part * last as f64;
         let (low, rest) = (place as usize, place.fract());
@@ -337,7 +340,7 @@ fn percentiles(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
     Some([at(0.5), at(0.9)])
 }
 
-/// What all segments say together.
+/// Statistics over all segments.
 struct Overall {
     error_rad_s: [f64; 2],
     measured_rad_s: f64,
@@ -355,32 +358,32 @@ fn overall(segments: &[(String, SegmentScore)]) -> Option<Overall> {
     })
 }
 
-/// Returns a part of what is told without its indents, each sentence on a line of its own: a deeper indent continues one.
+/// Returns a part of the text without its indents, one sentence per line; a deeper indent continues a sentence.
 fn paragraph(part: &str) -> String {
     part.trim().replace("\n    ", " ").replace("\n  ", "\n")
 }
 
-fn tell(request: &Request, estimation: &Estimation) -> String {
+fn results_text(request: &Request, estimation: &Estimation) -> String {
     let mut text = String::new();
-    tell_all(request, estimation, &mut text).expect("a string takes every text");
+    write_results(request, estimation, &mut text).expect("writing to a string does not fail");
     text
 }
 
-fn tell_all(request: &Request, estimation: &Estimation, text: &mut String) -> std::fmt::Result {
-    tell_log(&estimation.log, text)?;
+fn write_results(request: &Request, estimation: &Estimation, text: &mut String) -> std::fmt::Result {
+    write_log(&estimation.log, text)?;
     let [a1, a2, a3] = request.coefficients.into();
     let hidden = AXES[request.axis - 1];
-    writeln!(text, "\nthe rate about {hidden}, from the other two, of a body with a = ({a1:.4}, {a2:.4}, {a3:.4})")?;
+    writeln!(text, "\nestimate of the rate about {hidden}, for a body with a = ({a1:.4}, {a2:.4}, {a3:.4})")?;
     if request.damping_per_s != 0.0 {
         writeln!(text, "  damping {:.4} 1/s", request.damping_per_s)?;
     }
     if request.axes.is_some() {
-        writeln!(text, "  about principal axes that are turned against the sensor's")?;
+        writeln!(text, "  the principal axes are rotated against the sensor's")?;
     }
     match estimation.filter {
-        FilterKind::First { decay_per_s } => writeln!(text, "  filter of first order, decay {decay_per_s:.2} 1/s")?,
+        FilterKind::First { decay_per_s } => writeln!(text, "  first-order filter, decay {decay_per_s:.2} 1/s")?,
         FilterKind::Second { bandwidth_rad_s } => {
-            writeln!(text, "  filter of second order, bandwidth {bandwidth_rad_s:.2} rad/s")?;
+            writeln!(text, "  second-order filter, bandwidth {bandwidth_rad_s:.2} rad/s")?;
         }
         FilterKind::Kalman { noise_rad_s, density, .. } => {
             writeln!(text, "  Kalman filter, noise {noise_rad_s:.2e} rad/s, density {density:.2e} rad2/s3")?;
@@ -389,8 +392,8 @@ fn tell_all(request: &Request, estimation: &Estimation, text: &mut String) -> st
     if let (true, Some(choice)) = (estimation.chosen, &estimation.choice) {
         writeln!(
             text,
-            "  that rate is chosen: noise ({:.1e} rad/s) and model balance at {:.2} 1/s; segments of {:.2} s ask for {:.2} 1/s\n    \
-             to forget their first estimate; --decay sets another",
+            "  chosen decay: noise ({:.1e} rad/s) and model errors balance at {:.2} 1/s; segments of {:.2} s need {:.2} 1/s\n    \
+             to forget their first estimate; change it with --decay",
             choice.noise_rad_s, choice.balance_per_s, choice.segment_s, choice.forgetting_per_s
         )?;
     }
@@ -402,7 +405,7 @@ fn tell_all(request: &Request, estimation: &Estimation, text: &mut String) -> st
     let floor = estimation.floor_rad_s;
     writeln!(
         text,
-        "  not observable at {unobserved} of {samples} samples ({share:.1} %): the other two below {floor:.2e} rad/s"
+        "  not observable at {unobserved} of {samples} samples ({share:.1} %): both measured rates below {floor:.2e} rad/s"
     )?;
     match overall(&estimation.segments) {
         Some(overall) => {
@@ -413,13 +416,13 @@ fn tell_all(request: &Request, estimation: &Estimation, text: &mut String) -> st
             )?;
             writeln!(
                 text,
-                "  of a rate of {:.3} rad/s rms (median): {:.2} % and {:.2} % of each segment's own",
+                "  relative to the rate, {:.3} rad/s rms (median): median {:.2} %, 90th percentile {:.2} %",
                 overall.measured_rad_s,
                 100.0 * overall.part[0],
                 100.0 * overall.part[1]
             )?;
         }
-        None => writeln!(text, "\nno score: the log does not have the rate about {hidden}")?,
+        None => writeln!(text, "\nno score: the log lacks the rate about {hidden}")?,
     }
     if overall(&estimation.segments).is_some() && estimation.segments.len() <= LISTED {
         for (name, score) in &estimation.segments {

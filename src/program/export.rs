@@ -1,6 +1,6 @@
-//! `corotate export`: a recording as tables.
+//! `corotate export`: converts a recording to tables.
 
-use super::output::{Ended, Exit, Failure, fail, say};
+use super::output::{CommandResult, Exit, Failure, fail, say};
 use super::record;
 use crate::record::{ExportError, Recording, export_csv};
 use std::path::PathBuf;
@@ -11,16 +11,16 @@ use std::path::PathBuf;
 pub struct Arguments {
     /// A run's directory, a recording, or latest [default: runs/latest]
     run: Option<PathBuf>,
-    /// Write one CSV file per signal into this directory
+    /// Write one CSV file per signal to this directory
     #[arg(long, value_name = "DIR", group = "forms")]
     csv: Option<PathBuf>,
-    /// Write one Parquet file per signal into this directory
+    /// Write one Parquet file per signal to this directory
     #[arg(long, value_name = "DIR", group = "forms")]
     parquet: Option<PathBuf>,
-    /// Go on with what there is of a recording that is not complete
+    /// Accept an incomplete recording
     #[arg(long)]
     accept_incomplete: bool,
-    /// Print the files written as one JSON object (corotate/export/v1)
+    /// Print the paths as one JSON object (corotate/export/v1)
     #[arg(long)]
     json: bool,
 }
@@ -29,20 +29,20 @@ pub struct Arguments {
 const SCHEMA: &str = "corotate/export/v1";
 
 const EXAMPLES: &str = "\
-Every sample is a row: time in the run in s, when it was received in ns, and
-every element of every field. Numbers read back to the same bits.
+Every sample is a row: time in the run (s), time of reception (ns), and every
+element of every field. Numbers read back to the same bits.
 
 Examples:
-  corotate export --csv tables     the newest run here
+  corotate export --csv tables     the newest run in runs/
   head -2 tables/leader.estimate.csv
   corotate export runs/20261121T150000Z-rigid-pair --parquet tables";
 
-/// What there is to say to whoever asks a program for Parquet that was built without.
+/// The reason for refusal if the program was built without Parquet.
 const REFUSAL: &str =
     "--parquet: this program was built without Parquet; build it with `cargo build --release --features parquet`";
 
-/// Exports.
-pub fn export(arguments: &Arguments) -> Ended {
+/// Executes `corotate export`.
+pub fn export(arguments: &Arguments) -> CommandResult {
     if arguments.parquet.is_some() && !cfg!(feature = "parquet") {
         return Err(fail(Exit::Usage, Failure::new("built-without", REFUSAL)));
     }

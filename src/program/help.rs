@@ -1,9 +1,9 @@
-//! The command line as it describes itself: help that fits a screen, the version, completions, manual pages.
+//! Help that fits a screen, the version, completions and manual pages.
 //!
-//! Must not describe a command twice: everything is made of the definition by which the command line is read.
+//! Must not describe a command twice: all of it is generated from the definition that parses the command line.
 
 use super::color::When;
-use super::output::{Ended, Exit, Failure, fail, say};
+use super::output::{CommandResult, Exit, Failure, fail, say};
 use super::shipped::{name, scenarios, words_given};
 use crate::bus::iox;
 use crate::files;
@@ -14,16 +14,16 @@ use std::fmt::Write;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// How wide help may be: every terminal has so much.
+/// Width of help, in columns.
 pub const WIDTH: usize = 80;
-/// The commands that a user meets first, which help explains in a line each.
+/// The commands that the overview explains, one per line; it lists the names of the rest.
 const FIRST: [&str; 10] = ["run", "check", "init", "new", "report", "watch", "replay", "diff", "export", "doctor"];
 const TEMPLATE: &str = "{about}\n\n{usage-heading} {usage}{after-help}";
 const OPTIONS: &str = "\
-`COMMAND --help` explains a command, with examples; `COMMAND -h` in brief.
--V prints the version, --version more. --color auto|always|never is for all.
-Exit codes: 0 ok, 1 failure, 2 usage or configuration, 3 not accepted, or not
-the same, 4 a process died, 5 a privilege not granted, 128+n ended by signal n";
+`COMMAND --help` explains a command, with examples; `COMMAND -h` is shorter.
+-V prints the version, --version details. All take --color auto|always|never.
+Exit codes: 0 ok, 1 failure, 2 usage or configuration, 3 not accepted or not
+equal, 4 process died, 5 privilege not granted, 128+n ended by signal n";
 
 /// Options of `corotate completions`.
 #[derive(clap::Args)]
@@ -44,7 +44,7 @@ Examples:
 #[derive(clap::Args)]
 #[command(after_long_help = MAN)]
 pub struct ManArguments {
-    /// Where to write corotate.1 and a page for each command
+    /// Directory for corotate.1 and one page per command
     #[arg(value_name = "DIR")]
     directory: PathBuf,
 }
@@ -53,16 +53,16 @@ const MAN: &str = "\
 Example:
   corotate man ~/.local/share/man/man1 && man corotate-run";
 
-/// Returns the definition of the command line with its help, as it is read.
+/// Returns the definition of the command line, complete with version and help.
 pub fn line(definition: clap::Command) -> clap::Command {
     let line = named(definition);
     let version = format!("{}\n{}", version(), about_build());
     let overview = overview(&line) + OPTIONS;
-    // For the rest of the process, which reads its command line once.
+    // Leaked once: the process parses one command line.
     line.long_version(&*version.leak()).help_template(TEMPLATE).after_help(overview).color(asked_color())
 }
 
-/// Returns the definition with the program's name and version: what of it is the same on every machine.
+/// Returns the definition with the program's name and version, equal on every machine.
 fn named(definition: clap::Command) -> clap::Command {
     definition.name(name()).version(version())
 }
@@ -72,19 +72,19 @@ fn version() -> &'static str {
     if name() == env!("CARGO_PKG_NAME") { own } else { with }
 }
 
-/// What `--color` asks for. Help is printed while the line is read, so it cannot wait for the result.
+/// Returns the value of `--color`. clap prints help while it parses, so the parsed value is not yet available.
 fn asked_color() -> ColorChoice {
     let words: Vec<String> = words_given().iter().map(|word| word.to_string_lossy().into_owned()).collect();
-    let beside = words.windows(2).find(|pair| pair[0] == "--color").map(|pair| pair[1].as_str());
-    let within = || words.iter().find_map(|word| word.strip_prefix("--color="));
-    match beside.or_else(within).and_then(|word| When::from_str(word, false).ok()) {
+    let separate = words.windows(2).find(|pair| pair[0] == "--color").map(|pair| pair[1].as_str());
+    let joined = || words.iter().find_map(|word| word.strip_prefix("--color="));
+    match separate.or_else(joined).and_then(|word| When::from_str(word, false).ok()) {
         Some(When::Always) => ColorChoice::Always,
         Some(When::Never) => ColorChoice::Never,
         Some(When::Auto) | None => ColorChoice::Auto,
     }
 }
 
-/// The commands: what each does, or where there are more than a screen takes, their names.
+/// Returns the list of commands: the first ones explained, the rest by name, so that help fits a screen.
 fn overview(line: &clap::Command) -> String {
     let mut text = String::new();
     // Writing to a string does not fail.
@@ -93,9 +93,9 @@ fn overview(line: &clap::Command) -> String {
         let about = command.get_about().map(ToString::to_string).unwrap_or_default();
         let _ = writeln!(text, "  {:<9}{about}", command.get_name());
     }
-    let others = visible().map(clap::Command::get_name).filter(|name| !FIRST.contains(name));
+    let rest = visible().map(clap::Command::get_name).filter(|name| !FIRST.contains(name));
     let mut column = 0;
-    for name in others {
+    for name in rest {
         if column == 0 || column + name.len() + 1 > WIDTH {
             let _ = write!(text, "{}", if column == 0 { "  and: " } else { "\n      " });
             column = 6;
@@ -103,11 +103,11 @@ fn overview(line: &clap::Command) -> String {
         let _ = write!(text, " {name}");
         column += name.len() + 1;
     }
-    let alone = scenarios().first().map(|(first, _)| format!("Without a command the scenario {first} runs.\n"));
+    let alone = scenarios().first().map(|(first, _)| format!("Without a command, `run {first}` is executed.\n"));
     text + "\n\n" + &alone.unwrap_or_default()
 }
 
-/// What the program was made of, and for what.
+/// Returns revision, features and target of the build, and the machine.
 fn about_build() -> String {
     let features = [
         ("foxglove", cfg!(feature = "foxglove")),
@@ -117,7 +117,7 @@ fn about_build() -> String {
     ];
     let names = |is_built| features.iter().filter(move |(_, built)| *built == is_built).map(|(name, _)| *name);
     let built: Vec<&str> = names(true).collect();
-    // The hooks are for tests alone.
+    // The hooks are for tests.
     let absent: Vec<&str> = names(false).filter(|name| *name != "hooks").collect();
     let host = MachineInfo::local();
     format!(
@@ -132,10 +132,10 @@ fn about_build() -> String {
     )
 }
 
-/// Prints the completions for a shell.
-pub fn completions(arguments: &CompletionsArguments, definition: clap::Command) -> Ended {
+/// Prints the completions of a shell.
+pub fn completions(arguments: &CompletionsArguments, definition: clap::Command) -> CommandResult {
     let (all, mut text) = (named(definition), Vec::new());
-    // What help does not tell of is not offered either.
+    // Hidden commands are not completed.
     let shown = all.get_subcommands().filter(|command| !command.is_hide_set()).cloned();
     let mut line = clap::Command::new(name()).version(version());
     line = line.args(all.get_arguments().cloned()).subcommands(shown);
@@ -144,7 +144,7 @@ pub fn completions(arguments: &CompletionsArguments, definition: clap::Command) 
 }
 
 /// Writes the manual pages.
-pub fn man(arguments: &ManArguments, definition: clap::Command) -> Ended {
+pub fn man(arguments: &ManArguments, definition: clap::Command) -> CommandResult {
     let written = write_pages(arguments, definition);
     say(&written.map_err(|error| {
         fail(Exit::Failure, Failure::new("cannot-write", format!("{error}; name another directory")))
@@ -164,7 +164,7 @@ fn write_pages(ManArguments { directory }: &ManArguments, definition: clap::Comm
     for command in std::iter::once(&root).chain(commands) {
         let extra = command.get_after_long_help().map(ToString::to_string).unwrap_or_default();
         let source = format!("{} {}", name(), version());
-        // What the short help leaves out is not to be missing here.
+        // Manual pages contain the options that the short help omits.
         let whole = command.clone().after_long_help(None).mut_args(|arg| arg.hide_short_help(false));
         let man = clap_mangen::Man::new(whole).source(source);
         let path = directory.join(man.get_filename());
@@ -177,12 +177,12 @@ fn write_pages(ManArguments { directory }: &ManArguments, definition: clap::Comm
     Ok(written)
 }
 
-/// The last section of a page: what stands below the long help, line by line as it stands there.
+/// Returns the last section of a page: the text below the long help, with its line breaks.
 fn verbatim(text: &str) -> String {
     if text.is_empty() {
         return String::new();
     }
-    // A full stop or an apostrophe that begins a line would be a command to the formatter.
+    // A line that begins with a full stop or an apostrophe is a command to the formatter.
     let line = |line: &str| format!("\\&{}\n", line.replace('\\', "\\e").replace('-', "\\-"));
     format!(".SH NOTES\n.nf\n{}.fi\n", text.lines().map(line).collect::<String>())
 }
@@ -192,7 +192,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_formatter_would_obey_stands_as_it_is() {
+    fn formatter_commands_are_escaped() {
         assert_eq!(verbatim(".so x\n  a-b \\"), ".SH NOTES\n.nf\n\\&.so x\n\\&  a\\-b \\e\n.fi\n");
         assert_eq!(verbatim(""), "");
     }

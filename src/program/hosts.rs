@@ -1,40 +1,40 @@
-//! `corotate join`, the relay that it and `corotate run --listen` start, and the options by which hosts find one another.
+//! `corotate join`, its relay, and the options for connections between hosts.
 
-use super::output::{Ended, Exit, Failure, fail};
+use super::output::{CommandResult, Exit, Failure, fail};
 use super::signals::die_with;
 use crate::hosts::{Address, Endpoint, Keys};
 use std::path::PathBuf;
 
-/// How hosts show who they are.
+/// Options for the authentication of hosts.
 #[derive(clap::Args, Default, Clone)]
 pub struct KeyArguments {
-    /// The certificate of the authority that signed those of all hosts
+    /// Certificate of the authority that signed those of all hosts
     #[arg(long, value_name = "FILE", hide_short_help = true)]
     tls_ca: Option<PathBuf>,
-    /// This host's certificate
+    /// Certificate of this host
     #[arg(long, value_name = "FILE", hide_short_help = true)]
     tls_cert: Option<PathBuf>,
-    /// This host's private key
+    /// Private key of this host
     #[arg(long, value_name = "FILE", hide_short_help = true)]
     tls_key: Option<PathBuf>,
-    /// Let everybody join who reaches the address, without keys
+    /// Accept hosts without TLS (insecure)
     #[arg(long, hide_short_help = true)]
     insecure: bool,
 }
 
 impl KeyArguments {
-    /// Whether anything is said.
+    /// Returns true if any of the options is given.
     pub fn any(&self) -> bool {
         self.insecure || [&self.tls_ca, &self.tls_cert, &self.tls_key].into_iter().any(Option::is_some)
     }
 
-    /// An address with these keys, if that is allowed.
+    /// Returns the endpoint at an address, with these keys.
     pub fn endpoint(&self, address: Address) -> Result<Endpoint, Failure> {
         let keys = match (&self.tls_ca, &self.tls_cert, &self.tls_key) {
             (Some(ca), Some(cert), Some(key)) => Some(Keys { ca: ca.clone(), cert: cert.clone(), key: key.clone() }),
             (None, None, None) => None,
             _ => {
-                let text = "--tls-ca, --tls-cert and --tls-key go together; give all three, or none";
+                let text = "--tls-ca, --tls-cert and --tls-key belong together; give all three or none";
                 return Err(Failure::new("missing-keys", text));
             }
         };
@@ -43,8 +43,8 @@ impl KeyArguments {
         Ok(endpoint)
     }
 
-    /// What another host types to join at an address.
-    pub fn join_words(&self, address: &Address) -> String {
+    /// Returns the command line by which another host joins.
+    pub fn join_command(&self, address: &Address) -> String {
         let keys = if self.tls_ca.is_some() { " --tls-ca FILE --tls-cert FILE --tls-key FILE" } else { "" };
         let insecure = if self.insecure { " --insecure" } else { "" };
         format!("join {address}{keys}{insecure}")
@@ -55,10 +55,10 @@ impl KeyArguments {
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct JoinArguments {
-    /// Where the run listens: quic/HOST:PORT, or tcp/ or udp/ on loopback
+    /// Address of the run: quic/HOST:PORT, or tcp/ or udp/ on loopback
     #[arg(value_name = "ADDR")]
     address: Address,
-    /// This host's name in the run's scenario [default: one that is free]
+    /// This host's name in the scenario [default: a free one]
     #[arg(long, value_name = "NAME")]
     host: Option<String>,
     #[command(flatten)]
@@ -69,14 +69,14 @@ pub struct JoinArguments {
 }
 
 const EXAMPLES: &str = "\
-The scenario, with all that it names, comes from the host that launches. Both must
-be the same version with the same rigs. The results are written there.
+The launching host sends the scenario with its files, and writes the results.
+All hosts must run the same version with the same rigs.
 
 Examples:
   corotate run FILE --host bench --listen tcp/127.0.0.1:7447
-                                   on the host that launches; it waits
+                                   on the launching host; it waits
   corotate join tcp/127.0.0.1:7447
-                                   on every other: here, the same machine
+                                   on every other host; here the same machine
   corotate join quic/bench.example:7447 --tls-ca ca.pem --tls-cert flight.pem
            --tls-key flight.key    over a network";
 
@@ -97,7 +97,7 @@ pub struct RelayArguments {
     parent: Option<i32>,
 }
 
-/// Why this program has no part in runs over several hosts, if it is so.
+/// Returns the reason for refusal if the program was built without hosts.
 pub fn refusal() -> Option<&'static str> {
     (!cfg!(feature = "hosts")).then_some("this program was built without hosts; build it with `--features hosts`")
 }
@@ -106,18 +106,18 @@ fn unusable(failure: Failure) -> Exit {
     fail(Exit::Usage, failure)
 }
 
-/// Takes a host's part in a run, to its end.
-pub fn join(arguments: &JoinArguments) -> Ended {
+/// Joins a run to its end.
+pub fn join(arguments: &JoinArguments) -> CommandResult {
     with_hosts::join(arguments, arguments.keys.endpoint(arguments.address.clone()).map_err(unusable)?)
 }
 
-/// Examines the way to a host that waits for others.
-pub fn probe(address: &Address, keys: &KeyArguments, seconds: f64, json: bool) -> Ended {
+/// Measures the link to a waiting host.
+pub fn probe(address: &Address, keys: &KeyArguments, seconds: f64, json: bool) -> CommandResult {
     with_hosts::probe(&keys.endpoint(address.clone()).map_err(unusable)?, seconds, json)
 }
 
-/// Carries for a host of a run, to its end.
-pub fn relay(arguments: &RelayArguments) -> Ended {
+/// Runs the relay of a host to the end of the run.
+pub fn relay(arguments: &RelayArguments) -> CommandResult {
     arguments.parent.map_or(Ok(()), die_with)?;
     with_hosts::relay(arguments, arguments.keys.endpoint(arguments.address.clone()).map_err(unusable)?)
 }
@@ -126,15 +126,15 @@ pub fn relay(arguments: &RelayArguments) -> Ended {
 mod with_hosts {
     use super::*;
 
-    pub fn join(_arguments: &JoinArguments, _endpoint: Endpoint) -> Ended {
+    pub fn join(_arguments: &JoinArguments, _endpoint: Endpoint) -> CommandResult {
         Err(unusable(Failure::new("built-without", refusal().unwrap_or_default())))
     }
 
-    pub fn relay(_arguments: &RelayArguments, _endpoint: Endpoint) -> Ended {
+    pub fn relay(_arguments: &RelayArguments, _endpoint: Endpoint) -> CommandResult {
         Err(unusable(Failure::new("built-without", refusal().unwrap_or_default())))
     }
 
-    pub fn probe(_endpoint: &Endpoint, _seconds: f64, _json: bool) -> Ended {
+    pub fn probe(_endpoint: &Endpoint, _seconds: f64, _json: bool) -> CommandResult {
         Err(unusable(Failure::new("built-without", refusal().unwrap_or_default())))
     }
 }
@@ -153,7 +153,7 @@ mod with_hosts {
     use crate::scenario::Scenario;
     use crate::system::{random_bits, tell};
 
-    pub fn relay(arguments: &RelayArguments, endpoint: Endpoint) -> Ended {
+    pub fn relay(arguments: &RelayArguments, endpoint: Endpoint) -> CommandResult {
         let terminated = terminated_by_signals()?;
         let host = HostEndpoint { host: arguments.host.clone(), endpoint };
         let options = RelayOptions { domain: arguments.domain.clone(), host, hub: arguments.hub.clone() };
@@ -163,27 +163,27 @@ mod with_hosts {
         })
     }
 
-    pub fn probe(endpoint: &Endpoint, seconds: f64, json: bool) -> Ended {
+    pub fn probe(endpoint: &Endpoint, seconds: f64, json: bool) -> CommandResult {
         let probe = crate::hosts::probe(endpoint, seconds).map_err(|error| fail(Exit::Failure, error))?;
         let object = || serde_json::to_string(&probe).expect("figures are JSON") + "\n";
         say(&if json { object() } else { probe.to_string() })
     }
 
-    pub fn join(arguments: &JoinArguments, endpoint: Endpoint) -> Ended {
+    pub fn join(arguments: &JoinArguments, endpoint: Endpoint) -> CommandResult {
         let signal = catch_signals().map_err(|error| fail(Exit::Failure, error))?;
         let part = ask(arguments, &endpoint)?;
-        let tells = |words: &str| {
+        let print_unless_quiet = |text: &str| {
             if !arguments.quiet {
-                tell(words);
+                tell(text);
             }
         };
-        tells(&format!("host {} of the run that {} launched", part.host, part.hub));
-        // Read twice: how large a domain must be follows from the scenario, and the files that it names lie in the domain.
-        let aside = tempfile::tempdir()
+        print_unless_quiet(&format!("joined the run of host {} as host {}", part.hub, part.host));
+        // Read twice: the scenario determines the size of the domain, and its files belong in the domain.
+        let temporary = tempfile::tempdir()
             .map_err(|error| fail(Exit::Failure, Failure::new("cannot-create", format!("cannot join: {error}"))))?;
-        let sized = part.scenario(aside.path()).map_err(refused)?;
+        let sized = part.scenario(temporary.path()).map_err(refused)?;
         let owned = new_domain(&sized).map_err(|error| fail(exit_of(&error), error))?;
-        drop(aside);
+        drop(temporary);
         let scenario: Scenario = part.scenario(owned.domain().root()).map_err(refused)?;
         let seat = HostEndpoint { host: part.host.clone(), endpoint };
         let mut silent = |_: &crate::launch::Progress<'_>| {};
@@ -191,7 +191,7 @@ mod with_hosts {
         let outcome = crate::launch::join(&scenario, owned, &seat, &part.hub, &mut launch);
         let FarOutcome { failed, ticks: (executed, missed), .. } =
             outcome.map_err(|error| fail(exit_of(&error), error))?;
-        tells(&format!("the host {} executed {executed} ticks of its roles, {missed} missed", part.host));
+        print_unless_quiet(&format!("host {}: its roles executed {executed} ticks and missed {missed}", part.host));
         let signal = signal.load(std::sync::atomic::Ordering::Relaxed);
         Ok(match failed {
             Some(_) if signal != 0 => Exit::Signal(signal),
@@ -200,7 +200,7 @@ mod with_hosts {
         })
     }
 
-    /// Asks for a part in the run.
+    /// Asks the launching host for a part in the run.
     fn ask(arguments: &JoinArguments, endpoint: &Endpoint) -> Result<Admission, Exit> {
         let token =
             random_bits().map_err(|error| fail(Exit::Failure, Failure::new("no-random-numbers", error)))? as u64;

@@ -1,7 +1,7 @@
-//! `corotate identify`: a body's inertia from logs of its angular velocity.
+//! `corotate identify`: identifies a body's inertia from logs of its angular velocity.
 
-use super::data::{AXES, LogArguments, axis, exit_of, log_json, tell_log};
-use super::output::{Ended, Exit, Failure, fail, harmless, say};
+use super::data::{AXES, LogArguments, axis, exit_of, log_json, write_log};
+use super::output::{CommandResult, Exit, Failure, fail, harmless, say};
 use crate::data::{Identified, Ways, identify_logs};
 use crate::identify::{AxesFit, Finding, RecursiveFit, TensorFit, nearest_body};
 use crate::observe::InertiaRatios;
@@ -14,21 +14,21 @@ use std::path::PathBuf;
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// Logs of one body: CSV, MCAP or Parquet; - is CSV from the standard input
+    /// Logs of one body: CSV, MCAP or Parquet; - for CSV from stdin
     #[arg(required = true)]
     data: Vec<PathBuf>,
     #[command(flatten)]
     log: LogArguments,
-    /// Which result is the body that is printed last, and that `estimate` takes
+    /// Method whose result is printed last and passed to `estimate`
     #[arg(long, value_enum, default_value_t = Method::Axes)]
     method: Method,
-    /// The body is symmetric about this axis: x, y or z
+    /// Symmetry axis of the body: x, y or z
     #[arg(long, value_name = "AXIS", value_parser = axis, hide_short_help = true)]
     symmetry_axis: Option<usize>,
-    /// Fit no torque of the air: the motion is not damped
+    /// Do not fit air damping
     #[arg(long)]
     no_damping: bool,
-    /// The recursive filter's decay rate, s2/rad3, or 1/rad with --symmetry-axis [default: it forgets nothing]
+    /// Decay rate of the recursive filter, s2/rad3, or 1/rad with --symmetry-axis [default: 0, no forgetting]
     #[arg(long, value_name = "RATE", allow_negative_numbers = true, hide_short_help = true)]
     decay: Option<f64>,
     /// Print one line of JSON (corotate/identify/v1)
@@ -36,30 +36,34 @@ pub struct Arguments {
     json: bool,
 }
 
-/// The ways to a body.
+/// The identification methods.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum Method {
-    /// Least squares, the principal axes being the sensor's
+    /// Least squares; the principal axes are the sensor's
     Axes,
-    /// Least squares of the whole tensor, with its principal axes
+    /// Least squares of the whole tensor; finds the principal axes
     Tensor,
     /// The papers' recursive filter
     Recursive,
-    /// The same for a body that is symmetric about --symmetry-axis
+    /// The same filter for a body symmetric about --symmetry-axis
     Axisymmetric,
 }
 
 const EXAMPLES: &str = "\
-A free motion tells the ratios of the moments of inertia. All methods are computed and compared; what the log cannot tell is
-said. The log's columns are found by their names, or named. The last line is a body for a scenario.
+A free motion determines the ratios of the moments of inertia. All methods are
+computed and compared; notes name what the log does not determine. Columns are
+found by name, or given. The last line is a body for a scenario.
 
 Examples:
-  corotate identify gyro.csv                                           columns by the names that loggers use
-  corotate identify throws.csv --by throw                              many throws of one body in a file
-  corotate identify a.csv b.csv --time t --rates wx,wy,wz --time-unit ms --rate-unit deg/s
-  corotate identify gyro.csv --method tensor --json > body.json        for corotate estimate --body body.json";
+  corotate identify gyro.csv       columns found by name
+  corotate identify throws.csv --by throw
+                                   several throws of one body in a file
+  corotate identify a.csv b.csv --time t --rates wx,wy,wz --time-unit ms \\
+           --rate-unit deg/s       several files, columns and units given
+  corotate identify gyro.csv --method tensor --json > body.json
+                                   for `corotate estimate --body body.json`";
 
-/// A body as it is found.
+/// An identified body.
 struct Body {
     moments: Vector3<f64>,
     deviation: Option<Vector3<f64>>,
@@ -67,13 +71,13 @@ struct Body {
     axes: Option<Matrix3<f64>>,
 }
 
-/// Identifies.
-pub fn identify(arguments: &Arguments) -> Ended {
+/// Executes `corotate identify`.
+pub fn identify(arguments: &Arguments) -> CommandResult {
     let axisymmetric = arguments.method == Method::Axisymmetric;
     if axisymmetric && arguments.symmetry_axis.is_none() {
         return Err(fail(
             Exit::Usage,
-            Failure::new("missing-axis", "--method axisymmetric needs the axis; add --symmetry-axis x, y or z"),
+            Failure::new("missing-axis", "--method axisymmetric lacks an axis; add --symmetry-axis x, y or z"),
         ));
     }
     let ways = Ways { damping: !arguments.no_damping, decay: arguments.decay, symmetry_axis: arguments.symmetry_axis };
@@ -82,26 +86,26 @@ pub fn identify(arguments: &Arguments) -> Ended {
     let body = body(arguments, &identified);
     let text = match arguments.json {
         true => format!("{}\n", to_json(arguments, &identified, body.as_ref().ok())),
-        false => harmless(&tell(arguments, &identified, body.as_ref().ok())),
+        false => harmless(&results_text(arguments, &identified, body.as_ref().ok())),
     };
     say(&text)?;
     body.map(|_| Exit::Ok).map_err(|failure| fail(Exit::Failure, failure))
 }
 
-/// The body of the method that was asked for; why there is none.
+/// Returns the body identified by `--method`.
 fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, Failure> {
     let forbids = |finding: &&Finding| match arguments.method {
         Method::Tensor => finding.forbids_tensor(),
         Method::Axes | Method::Recursive => finding.forbids_axes(),
-        // One axis of spin is enough for its one coefficient.
+        // Its single coefficient needs spin about one axis only.
         Method::Axisymmetric => matches!(finding, Finding::Short { .. } | Finding::Still { .. }),
     };
     if let Some(finding) = identified.findings.iter().find(forbids) {
-        return Err(Failure::prefixed("the log tells of no body", *finding));
+        return Err(Failure::prefixed("the log does not determine a body", *finding));
     }
     let nothing =
-        || Failure::new("no-motion", "the log tells of no body: it has no motion that can be fitted; see the notes");
-    let of_fit = |fit: &Option<TensorFit>, turned: bool| -> Result<Body, Failure> {
+        || Failure::new("no-motion", "the log does not determine a body: no motion can be fitted; see the notes");
+    let body_from_fit = |fit: &Option<TensorFit>, turned: bool| -> Result<Body, Failure> {
         let fit = fit.as_ref().ok_or_else(nothing)?;
         let (moments, deviation) = (fit.moments, fit.deviation);
         Ok(Body { moments, deviation, damping_per_s: fit.damping_per_s, axes: turned.then_some(fit.axes) })
@@ -110,8 +114,8 @@ fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, Failure>
     let known =
         |moments: Vector3<f64>| Body { moments: moments / moments.max(), deviation: None, damping_per_s, axes: None };
     let found: Body = match arguments.method {
-        Method::Axes => of_fit(&identified.body, false)?,
-        Method::Tensor => of_fit(&identified.tensor, true)?,
+        Method::Axes => body_from_fit(&identified.body, false)?,
+        Method::Tensor => body_from_fit(&identified.tensor, true)?,
         Method::Recursive => {
             let ratios = InertiaRatios::new(&identified.recursive.coefficients)
                 .map_err(|error| Failure::new("no-body", error))?;
@@ -127,24 +131,24 @@ fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, Failure>
         }
     };
     let (inertia, flattened) = nearest_body(&found.moments)
-        .map_err(|error| Failure::prefixed("the moments that fit best are no body's", error))?;
+        .map_err(|error| Failure::prefixed("the best-fitting moments are impossible for a body", error))?;
     let moments = if flattened { inertia.moments_kg_m2() } else { found.moments };
     Ok(Body { moments, ..found })
 }
 
-fn tell(arguments: &Arguments, identified: &Identified, body: Option<&Body>) -> String {
+fn results_text(arguments: &Arguments, identified: &Identified, body: Option<&Body>) -> String {
     let mut text = String::new();
-    tell_all(arguments, identified, body, &mut text).expect("a string takes every text");
+    write_results(arguments, identified, body, &mut text).expect("writing to a string does not fail");
     text
 }
 
-fn tell_all(
+fn write_results(
     arguments: &Arguments,
     identified: &Identified,
     body: Option<&Body>,
     text: &mut String,
 ) -> std::fmt::Result {
-    identified.logs.iter().try_for_each(|log| tell_log(log, text))?;
+    identified.logs.iter().try_for_each(|log| write_log(log, text))?;
     let account = &identified.account;
     let (turns, pieces) = (account.turn_rad / std::f64::consts::TAU, account.pieces);
     writeln!(
@@ -153,29 +157,29 @@ fn tell_all(
         account.duration_s, account.fastest_rad_s
     )?;
     if let Some(fit) = &identified.axes {
-        tell_axes(fit, text)?;
+        write_axes(fit, text)?;
     }
     if let Some(fit) = &identified.body {
         writeln!(text, "one body about the sensor's axes, least squares")?;
-        row("moments, the largest 1", &fit.moments, text)?;
+        row("moments, largest = 1", &fit.moments, text)?;
         deviations(fit.deviation.as_ref(), text)?;
         damping(fit, text)?;
     }
     if let Some(fit) = &identified.tensor {
-        tell_tensor(fit, text)?;
+        write_tensor(fit, text)?;
     }
-    writeln!(text, "the papers' recursive filter{}", words_of(arguments, identified))?;
+    writeln!(text, "the papers' recursive filter{}", memory_text(arguments, identified))?;
     let sensor = identified.axes.map_or(0.0, |fit| fit.residual_rad_s.norm() / 3.0_f64.sqrt());
-    tell_recursive(&identified.recursive, sensor, text)?;
+    write_recursive(&identified.recursive, sensor, text)?;
     if let Ok(ratios) = InertiaRatios::new(&identified.recursive.coefficients) {
         let moments = Vector3::new(1.0, ratios.second, ratios.third);
-        row("moments, the largest 1", &(moments / moments.max()), text)?;
+        row("moments, largest = 1", &(moments / moments.max()), text)?;
         writeln!(text, "  a1 + a2 + a3 + a1 a2 a3            {:>11.4}", ratios.closure)?;
     }
     if let (Some(fit), Some(axis)) = (&identified.axisymmetric, arguments.symmetry_axis) {
         writeln!(text, "the papers' recursive filter, symmetric about {}", AXES[axis - 1])?;
-        tell_recursive(fit, sensor, text)?;
-        writeln!(text, "  moment about it over the other two {:>11.4}", 1.0 - fit.coefficients.x)?;
+        write_recursive(fit, sensor, text)?;
+        writeln!(text, "  axial / transverse moment          {:>11.4}", 1.0 - fit.coefficients.x)?;
     }
     writeln!(text)?;
     identified.findings.iter().try_for_each(|finding| writeln!(text, "note: {finding}"))?;
@@ -192,7 +196,7 @@ fn tell_all(
     }
 }
 
-/// What a method is called on the command line.
+/// Returns the name of a method on the command line.
 fn name(method: Method) -> &'static str {
     match method {
         Method::Axes => "axes",
@@ -202,51 +206,55 @@ fn name(method: Method) -> &'static str {
     }
 }
 
-fn words_of(arguments: &Arguments, identified: &Identified) -> String {
-    let memory = arguments.decay.map_or(", forgetting nothing".to_owned(), |decay| format!(", decay {decay}"));
+fn memory_text(arguments: &Arguments, identified: &Identified) -> String {
+    let memory = arguments.decay.map_or(", no forgetting".to_owned(), |decay| format!(", decay {decay}"));
     let damping = identified.recursive_damping_per_s;
-    if damping == 0.0 { memory } else { format!("{memory}, damping {damping:.3} 1/s taken as known") }
+    if damping == 0.0 { memory } else { format!("{memory}, assuming damping {damping:.3} 1/s") }
 }
 
-fn tell_axes(fit: &AxesFit, text: &mut String) -> std::fmt::Result {
-    writeln!(text, "each of the sensor's axes by itself, least squares {:>6}{:>12}{:>12}", "x", "y", "z")?;
+fn write_axes(fit: &AxesFit, text: &mut String) -> std::fmt::Result {
+    writeln!(text, "each sensor axis alone, least squares          {:>6}{:>12}{:>12}", "x", "y", "z")?;
     row("coefficient a", &fit.coefficients, text)?;
     deviations(fit.deviation.as_ref(), text)?;
     if fit.damping_per_s != Vector3::zeros() {
         row("damping, 1/s", &fit.damping_per_s, text)?;
         deviations(fit.damping_deviation_per_s.as_ref(), text)?;
     }
-    row("R2, part that is explained", &fit.r_squared, text)?;
-    row("left unexplained, rad/s rms", &fit.residual_rad_s, text)?;
-    writeln!(text, "  a1 + a2 + a3 + a1 a2 a3, 0 of a body {:>11.4}", fit.closure())
+    row("R2, explained part", &fit.r_squared, text)?;
+    row("residual, rad/s rms", &fit.residual_rad_s, text)?;
+    writeln!(text, "  a1 + a2 + a3 + a1 a2 a3, ideally 0 {:>11.4}", fit.closure())
 }
 
-fn tell_tensor(fit: &TensorFit, text: &mut String) -> std::fmt::Result {
+fn write_tensor(fit: &TensorFit, text: &mut String) -> std::fmt::Result {
     writeln!(text, "the whole tensor, least squares")?;
-    row("moments, the largest 1", &fit.moments, text)?;
+    row("moments, largest = 1", &fit.moments, text)?;
     deviations(fit.deviation.as_ref(), text)?;
     damping(fit, text)?;
     for (sensor, letter) in AXES.iter().enumerate() {
-        row(&format!("principal axes, their {letter}"), &fit.axes.row(sensor).transpose(), text)?;
+        row(&format!("principal axes, {letter} component"), &fit.axes.row(sensor).transpose(), text)?;
     }
-    row("off the sensor's axes, degrees", &fit.tilt_rad().map(f64::to_degrees), text)?;
+    row("angle to sensor axes, degrees", &fit.tilt_rad().map(f64::to_degrees), text)?;
     deviations(fit.axes_deviation_rad.map(|deviation| deviation.map(f64::to_degrees)).as_ref(), text)?;
-    row("R2, part that is explained", &fit.r_squared, text)
+    row("R2, explained part", &fit.r_squared, text)
 }
 
 fn damping(fit: &TensorFit, text: &mut String) -> std::fmt::Result {
     if fit.damping_per_s == 0.0 {
         return Ok(());
     }
-    let deviation = fit.damping_deviation_per_s.map_or(String::new(), |one| format!(" (standard deviation {one:.4})"));
+    let deviation =
+        fit.damping_deviation_per_s.map_or(String::new(), |deviation| format!(" (standard deviation {deviation:.4})"));
     writeln!(text, "  damping, 1/s                       {:>11.4}{deviation}", fit.damping_per_s)
 }
 
-fn tell_recursive<const N: usize>(fit: &RecursiveFit<N>, noise_rad_s: f64, text: &mut String) -> std::fmt::Result {
+fn write_recursive<const N: usize>(fit: &RecursiveFit<N>, noise_rad_s: f64, text: &mut String) -> std::fmt::Result {
     row("coefficient a", &fit.coefficients, text)?;
     deviations(fit.deviation_per_rad_s.map(|deviation| deviation * noise_rad_s).as_ref(), text)?;
     let [used, unexcited, ambiguous] = fit.steps;
-    writeln!(text, "  {used} steps used, {unexcited} without excitation, {ambiguous} too long for the motion")
+    writeln!(
+        text,
+        "  {used} steps used, {unexcited} skipped without excitation, {ambiguous} skipped as too long for the motion"
+    )
 }
 
 fn row<const N: usize>(label: &str, values: &SVector<f64, N>, text: &mut String) -> std::fmt::Result {
@@ -329,7 +337,7 @@ fn triple(vector: &Vector3<f64>) -> [f64; 3] {
     (*vector).into()
 }
 
-/// A matrix row by row; its columns are the principal axes.
+/// Returns a matrix row by row; its columns are the principal axes.
 fn rows(matrix: &Matrix3<f64>) -> [[f64; 3]; 3] {
     [0, 1, 2].map(|row| [0, 1, 2].map(|column| matrix[(row, column)]))
 }

@@ -1,6 +1,6 @@
-//! `corotate init`: print a shipped scenario or campaign, or the list of them.
+//! `corotate init`: prints a shipped scenario or campaign, or a list.
 
-use super::output::{Ended, Exit, fail, say};
+use super::output::{CommandResult, Exit, fail, say};
 use super::scenario::{title, unknown};
 use super::shipped::{campaigns, scenarios};
 
@@ -11,10 +11,10 @@ const SCHEMA: &str = "corotate/scenarios/v1";
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// Name of a scenario or campaign that ships with the program
+    /// Name of a shipped scenario or campaign
     #[arg(required_unless_present = "list")]
     name: Option<String>,
-    /// List the scenarios and campaigns that ship with the program, a line each
+    /// List the shipped scenarios and campaigns
     #[arg(long, conflicts_with = "name")]
     list: bool,
     /// Print the list as one JSON object (corotate/scenarios/v1)
@@ -24,11 +24,11 @@ pub struct Arguments {
 
 const EXAMPLES: &str = "\
 Examples:
-  corotate init --list                     what there is
+  corotate init --list                     list all names
   corotate init rigid-pair > pair.toml     a scenario with every key explained";
 
 /// Prints a scenario, or the list.
-pub fn init(arguments: &Arguments) -> Ended {
+pub fn init(arguments: &Arguments) -> CommandResult {
     let Some(name) = &arguments.name else {
         return say(&list(arguments.json));
     };

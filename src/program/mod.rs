@@ -1,9 +1,9 @@
 //! The command line: parse, validate, call the library, map errors to exit codes. No logic of its own.
 //!
-//! [`Program`] is the door for whoever has a rig: his `main` names it, and is launcher, roles and tools at once, because roles
-//! are started from the program's own file.
+//! [`Program`] is the entry point for programs with rigs. One executable is launcher, roles and tools, because the launcher
+//! starts roles from the program's own file.
 
-// The comments on arguments are what `--help` prints: no Markdown.
+// `--help` prints the comments on arguments: no Markdown.
 #![allow(rustdoc::broken_intra_doc_links, rustdoc::invalid_html_tags)]
 
 mod bench;
@@ -62,81 +62,81 @@ use std::time::Duration;
 struct Arguments {
     #[command(subcommand)]
     command: Option<Command>,
-    /// When to colour what is printed; NO_COLOR is heeded
+    /// Colour the output; auto: on terminals, unless NO_COLOR is set
     #[arg(long, global = true, value_name = "WHEN", default_value = "auto", value_enum, hide_short_help = true)]
     color: When,
 }
 
 #[derive(Subcommand)]
 enum Command {
-    /// Run a scenario to its end and tell how it went
+    /// Run a scenario and print its verdict
     Run(run::Arguments),
-    /// Run a campaign: one scenario many times, varied; on all cores
+    /// Run a campaign: many variants of one scenario, on all cores
     Sweep(sweep::Arguments),
-    /// Validate scenarios; print what may be claimed of their loops
+    /// Validate scenarios and print the claims about their loops
     Check(check::Arguments),
-    /// Print a commented scenario to start from, or list them
+    /// Print a commented scenario, or list all scenarios
     Init(init::Arguments),
-    /// Write a crate with a rig of your own to start from
+    /// Create a crate with a rig of your own
     New(new::Arguments),
-    /// Print what a program of your own needs to take a role's seat, as JSON
+    /// Print, as JSON, what a program of your own needs to be a role
     Seat(seat::Arguments),
-    /// Take the seat of a body in a run (the launcher starts it; so can you)
+    /// Run one body of a run (normally started by the launcher)
     Plant(role::PlantArguments),
-    /// Take the observer's seat in a run
+    /// Run the observer of a run (normally started by the launcher)
     Observer(role::Arguments),
-    /// Take the controller's seat in a run
+    /// Run the controller of a run (normally started by the launcher)
     Controller(role::Arguments),
-    /// Put a device behind a serial line into a role's seat in a run
+    /// Connect a device on a serial line to a run, as a role
     Bridge(bridge::Arguments),
     /// Record every sample of a running loop to a file
     Record(record::Arguments),
-    /// Feed a recording to the live roles, and compare bit for bit
+    /// Feed a recording to the roles and compare bit for bit
     Replay(replay::Arguments),
     /// Compare two recordings
     Diff(diff::Arguments),
-    /// Write a recording as tables
+    /// Convert a recording to tables
     Export(export::Arguments),
-    /// Show a run, or a recording, as one page
+    /// Write a report of a run, a recording or a campaign (HTML)
     Report(report::Arguments),
     /// Watch a running loop on the terminal
     Watch(watch::Arguments),
-    /// Show a running loop on a Foxglove WebSocket
+    /// Serve a running loop to Foxglove (WebSocket)
     Foxglove(foxglove::Arguments),
-    /// Take this host's part in a run that another host launched
+    /// Join a run that another host launched
     Join(hosts::JoinArguments),
-    /// Find a body's inertia in a log of its angular velocity
+    /// Identify a body's inertia from logs of its angular velocity
     Identify(identify::Arguments),
-    /// Find the rate about one axis in a log of the other two
+    /// Estimate the rate about one axis from a log of the other two
     Estimate(Box<estimate::Arguments>),
-    /// Tell whether this machine is fit for real time, and what to do
+    /// Check whether this machine is fit for real time
     Doctor(doctor::Arguments),
-    /// Measure what everything costs beside its floors, on this machine
+    /// Measure latencies and costs on this machine
     Bench(bench::Arguments),
-    /// Print a JSON Schema of scenarios, for editors
+    /// Print the JSON Schema of scenarios, for editors
     Schema(schema::Arguments),
-    /// Print the completions for a shell
+    /// Print the completions of a shell
     Completions(help::CompletionsArguments),
-    /// Write the manual pages into a directory
+    /// Write the manual pages to a directory
     Man(help::ManArguments),
-    /// Carry what crosses from this host of a run to others, and back
+    /// Exchange signals with the other hosts of a run
     #[command(hide = true)]
     Relay(hosts::RelayArguments),
-    /// Take the other end of a hop that is measured
+    /// Be the other end of a measured hop
     #[command(hide = true)]
     BenchPeer(bench::PeerArguments),
-    /// Clean up after processes of a run that were killed, and after its launcher
+    /// Remove what killed processes of a run leave behind
     #[command(hide = true)]
     Janitor(JanitorArguments),
 }
 
-/// Whom the launcher's janitor cleans up after.
+/// Options of the janitor.
 #[derive(clap::Args)]
 struct JanitorArguments {
     /// The run's domain
     #[arg(long)]
     domain: PathBuf,
-    /// For how long somebody may stand still while he makes a file, s
+    /// The longest time that a process may take to create a file, s
     #[arg(long)]
     limit_s: f64,
 }
@@ -160,12 +160,12 @@ pub struct Program {
 }
 
 impl Program {
-    /// A program without rigs.
+    /// Creates a program without rigs.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Adds a rig: scenarios may name it.
+    /// Adds a rig for scenarios.
     #[must_use]
     pub fn rig<R: Rig>(mut self) -> Self {
         self.rigs.push(RigKind::new::<R>());
@@ -179,64 +179,63 @@ impl Program {
         self
     }
 
-    /// Adds a scenario that ships with the program, by its name and its text: the name stands for it wherever a scenario is
-    /// taken, `init` prints it, and the first one runs where none is named. The first line of the text, a comment, is what
-    /// `init --list` says of it.
+    /// Adds a scenario that ships with the program. Commands accept its name wherever they take a scenario, and `init`
+    /// prints it. Without a command the first one runs. `init --list` prints the first line of the text, a comment.
     #[must_use]
     pub fn scenario(mut self, name: &'static str, text: &'static str) -> Self {
         self.scenarios.push((name, text));
         self
     }
 
-    /// Adds a campaign that ships with the program, by its name and its text, as [`scenario`](Self::scenario) does a scenario.
+    /// Adds a campaign that ships with the program, as [`scenario`](Self::scenario) adds a scenario.
     #[must_use]
     pub fn campaign(mut self, name: &'static str, text: &'static str) -> Self {
         self.campaigns.push((name, text));
         self
     }
 
-    /// Does what the command line asks for; the exit code is the process's.
+    /// Executes the command line and returns the exit code of the process.
     ///
     /// # Panics
-    /// If a scenario was read before: the rigs are known from then on.
+    /// If a scenario was read before: rigs cannot be added after that.
     pub fn main(self) -> ExitCode {
-        ExitCode::from(self.obey(std::env::args_os().collect()))
+        ExitCode::from(self.execute(std::env::args_os().collect()))
     }
 
-    /// The same for a program that is a library in an interpreter: does what these words ask for, the first of which is its name,
-    /// and gives the exit code. It may end the process, as a program does that was asked for help.
+    /// Executes the command line `words` and returns the exit code, for programs that are a library in an interpreter. The
+    /// first word is the program's name. May end the process, for example after printing help.
     ///
     /// # Panics
     /// As [`main`](Self::main).
-    pub fn obey(self, words: Vec<OsString>) -> u8 {
+    pub fn execute(self, words: Vec<OsString>) -> u8 {
         let _ = WORDS.set(words);
         self.begin();
         let arguments =
             Arguments::from_arg_matches_mut(&mut help::line(Arguments::command()).get_matches_from(words_given()));
         let Arguments { command, color } = arguments.unwrap_or_else(|error| error.exit());
         color::choose(color);
-        // A user's rig may panic, and iceoryx2 does where the system does what it holds impossible; the hook has told it. What
-        // this process holds is put away on the way here.
-        let exit = std::panic::catch_unwind(|| obey(command)).unwrap_or(Exit::Failure);
+        // A user's rig may panic, and so may iceoryx2 on unexpected system errors. The hook has printed the panic; unwinding
+        // releases the resources of this process.
+        let exit = std::panic::catch_unwind(|| execute(command)).unwrap_or(Exit::Failure);
         exit.code()
     }
 
-    /// Measures rows as the command `bench` does its own, with its options: the whole `main` of a bench target.
+    /// Measures rows like the command `bench`, with its options: the `main` of a bench target.
     ///
     /// # Panics
-    /// If a scenario was read before: the rigs are known from then on.
+    /// If a scenario was read before: rigs cannot be added after that.
     pub fn bench(self, rows: &[Row]) -> ExitCode {
         self.begin();
-        // `cargo bench` adds a word of its own.
+        // `cargo bench` adds this word.
         let words = std::env::args().filter(|word| word != "--bench");
         ExitCode::from(bench::bench(&BenchArguments::parse_from(words).bench, rows).code())
     }
 
     fn begin(self) {
-        assert!(register(self.rigs), "a program comes before any scenario is read");
+        assert!(register(self.rigs), "rigs must be registered before any scenario is read");
         let _ = SCENARIOS.set(self.scenarios);
         let _ = CAMPAIGNS.set(self.campaigns);
-        // A file that meets its size limit is an error like a full disk, told by whoever writes it; without this it is the end.
+        // A file at its size limit is then an error of its writer, like a full disk; without this the signal kills the process.
         let _ = signal_hook::flag::register(libc::SIGXFSZ, Arc::default());
         panics::set_hook(crate::FILE, remark);
     }
@@ -249,9 +248,9 @@ struct BenchArguments {
     bench: bench::Arguments,
 }
 
-/// Does what the command line asks for.
-fn obey(command: Option<Command>) -> Exit {
-    let ended = match command {
+/// Executes a command; without one, `run` with its defaults.
+fn execute(command: Option<Command>) -> Exit {
+    let result = match command {
         None => Ok(run::run(&run::Arguments::default())),
         Some(Command::Run(arguments)) => Ok(run::run(&arguments)),
         Some(Command::Sweep(arguments)) => sweep::sweep(&arguments),
@@ -259,7 +258,7 @@ fn obey(command: Option<Command>) -> Exit {
         Some(Command::Init(arguments)) => init::init(&arguments),
         Some(Command::New(arguments)) => new::new(&arguments),
         Some(Command::Seat(arguments)) => seat::seat(&arguments),
-        Some(Command::Plant(arguments)) => role::role(&arguments.body, &arguments.seat),
+        Some(Command::Plant(arguments)) => role::role(&arguments.body, &arguments.role),
         Some(Command::Observer(arguments)) => role::role("observer", &arguments),
         Some(Command::Controller(arguments)) => role::role("controller", &arguments),
         Some(Command::Bridge(arguments)) => bridge::bridge(&arguments),
@@ -282,13 +281,13 @@ fn obey(command: Option<Command>) -> Exit {
         Some(Command::BenchPeer(arguments)) => Ok(bench::peer(&arguments)),
         Some(Command::Janitor(arguments)) => Ok(janitor(&arguments)),
     };
-    ended.unwrap_or_else(|exit| exit)
+    result.unwrap_or_else(|exit| exit)
 }
 
 fn janitor(arguments: &JanitorArguments) -> Exit {
     let limit = Duration::try_from_secs_f64(arguments.limit_s).map_err(|error| Failure::new("out-of-range", error));
     let domain = Domain::join(&arguments.domain).map_err(Failure::from);
-    // Without the buffers of the standard streams: what is in one is not seen by whoever waits for input.
+    // Unbuffered: poll(2) does not see input in the buffer of a standard stream.
     let line = io::stdin().as_fd().try_clone_to_owned().map(File::from);
     let line = line.map_err(|error| Failure::new("no-standard-input", error));
     match (limit, domain, line) {

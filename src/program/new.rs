@@ -1,31 +1,31 @@
-//! `corotate new`: a crate of one's own to start from, the one of `examples/motor-pair` under another name.
+//! `corotate new`: creates a crate, a copy of `examples/motor-pair` under another name.
 
-use super::output::{Ended, Exit, Failure, fail, say};
+use super::output::{CommandResult, Exit, Failure, fail, say};
 use crate::files::{create_directories, write};
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// The files of the example. Its manifest is not among them: a package does not hold that of another.
+/// The files of the example, without its manifest: a package cannot contain the manifest of another package.
 const FILES: [(&str, &str); 3] = [
     ("src/main.rs", include_str!("new/main.rs")),
     ("NAME.toml", include_str!("new/scenario.toml")),
     ("tests/clocks.rs", include_str!("new/clocks.rs")),
 ];
-/// What the example is called.
+/// Name of the example.
 const EXAMPLE: &str = "motor-pair";
-/// What nothing may be called: the rigs of this crate, and names that Cargo refuses.
+/// Refused names: this crate's own, and names that Cargo refuses.
 const TAKEN: [&str; 4] = ["corotate", "test", "core", "std"];
 
 /// Options of `corotate new`.
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// What the crate, its rig and its scenario are called: 2 to 32 of a-z, 0-9 and -
+    /// Name of the crate, its rig and its scenario: 2 to 32 of a-z, 0-9 and -
     name: String,
-    /// Where to write it [default: ./NAME]
+    /// Directory of the crate [default: ./NAME]
     #[arg(long, value_name = "DIR")]
     path: Option<PathBuf>,
-    /// Print where the crate is as one JSON object (corotate/new/v1)
+    /// Print the crate's path as one JSON object (corotate/new/v1)
     #[arg(long)]
     json: bool,
 }
@@ -36,40 +36,40 @@ const SCHEMA: &str = "corotate/new/v1";
 const EXAMPLES: &str = "\
 Example:
   corotate new thermostat && cd thermostat && cargo test
-                                   a crate with a rig of its own, that runs;
-                                   make the rig yours (docs/your-own-rig.md)";
+                                   create a crate with a rig that works, then
+                                   change the rig (docs/your-own-rig.md)";
 
 /// Writes the crate.
-pub fn new(arguments: &Arguments) -> Ended {
+pub fn new(arguments: &Arguments) -> CommandResult {
     let name = &arguments.name;
     let plain = (2..=32).contains(&name.len())
         && name.starts_with(|first: char| first.is_ascii_lowercase())
         && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
     if !plain || name.ends_with('-') || TAKEN.contains(&&**name) {
-        let reason = "cannot name a crate and its scenario; use 2 to 32 of a-z, 0-9 and -, a letter first";
-        return Err(fail(Exit::Usage, Failure::new("bad-name", format!("`{name}` {reason}"))));
+        let reason = "invalid or reserved name; use 2 to 32 of a-z, 0-9 and -, a letter first";
+        return Err(fail(Exit::Usage, Failure::new("bad-name", format!("`{name}`: {reason}"))));
     }
     let directory = arguments.path.clone().unwrap_or_else(|| PathBuf::from(name));
     if directory.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
         let path = directory.display();
-        let reason = format!("{path} is there already and is not empty; name another with --path");
+        let reason = format!("{path} exists and is not empty; name another directory with --path");
         return Err(fail(Exit::Usage, Failure::new("not-empty", reason)));
     }
     match write_all(&directory, name) {
-        Ok(()) => say(&told(&directory, arguments.json)),
+        Ok(()) => say(&created_text(&directory, arguments.json)),
         Err(error) => {
-            let reason = format!("{}: {error}; name another with --path", directory.display());
+            let reason = format!("cannot write {}: {error}; name another directory with --path", directory.display());
             Err(fail(Exit::Failure, Failure::new("cannot-write", reason)))
         }
     }
 }
 
-fn told(directory: &Path, json: bool) -> String {
+fn created_text(directory: &Path, json: bool) -> String {
     let path = directory.display();
     if json {
         return format!("{}\n", serde_json::json!({ "schema": SCHEMA, "crate": path.to_string() }));
     }
-    format!("{path}: a crate with a rig of its own\n  cd {path}\n  cargo test\n  cargo run --release\n")
+    format!("created the crate {path}; next:\n  cd {path}\n  cargo test\n  cargo run --release\n")
 }
 
 fn write_all(directory: &Path, name: &str) -> io::Result<()> {
@@ -82,7 +82,7 @@ fn write_all(directory: &Path, name: &str) -> io::Result<()> {
     write(&directory.join(".gitignore"), b"/target\n/runs\n")
 }
 
-/// The manifest: with the sources that this program was built from where they are here, otherwise with the published ones.
+/// Returns the manifest. It depends on the sources of this program if they are on this machine, else on the published crate.
 fn manifest(name: &str) -> String {
     let (version, sources) = (env!("CARGO_PKG_VERSION"), Path::new(env!("CARGO_MANIFEST_DIR")));
     let own = std::fs::read_to_string(sources.join("Cargo.toml"));

@@ -1,11 +1,11 @@
-//! What a command prints, and the exit code that it gives its parent.
+//! Output and exit codes of commands.
 
 pub use crate::failure::Failure;
 use crate::launch::LaunchError;
 use crate::system::remedy;
 use std::io::{self, Write};
 
-/// What the process says to its parent.
+/// The exit code of the process.
 #[derive(Clone, Copy)]
 pub enum Exit {
     Ok,
@@ -31,22 +31,22 @@ impl Exit {
     }
 }
 
-/// Prints an error, one paragraph per line of it, and gives the exit code.
+/// Prints an error to stderr, each of its lines with the program's name, and returns the exit code.
 pub fn fail(exit: Exit, error: impl Into<Failure>) -> Exit {
     remark(&error.into());
     exit
 }
 
-/// Prints what there is to be said beside the results.
+/// Prints a remark to stderr, each of its lines with the program's name.
 pub fn remark(text: &dyn std::fmt::Display) {
     for line in harmless(&text.to_string()).lines() {
-        // Without a stderr the exit code is all there is to say.
+        // Without a stderr only the exit code remains.
         let _ = writeln!(io::stderr(), "corotate: {line}");
     }
 }
 
-/// A text that may come from a file, as it may stand on a terminal: what would command it, or turn the order of letters, is
-/// shown by its number.
+/// Returns the text with control characters and bidirectional overrides escaped, because text from files may reach a
+/// terminal.
 pub fn harmless(text: &str) -> String {
     let shown = |letter: char| match letter {
         '\n' => letter.to_string(),
@@ -59,7 +59,7 @@ pub fn harmless(text: &str) -> String {
     text.chars().map(shown).collect()
 }
 
-/// Prints to stdout, or says why not. A reader that has had enough and is gone, as `head`, is no error.
+/// Prints to stdout. A reader that closed the pipe early, such as `head`, is not an error.
 pub fn print(text: &str) -> Result<(), Failure> {
     let mut stdout = io::stdout().lock();
     match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
@@ -70,15 +70,15 @@ pub fn print(text: &str) -> Result<(), Failure> {
     }
 }
 
-/// How a command ended: with an error if it stopped early. Its reason is printed then.
-pub type Ended = Result<Exit, Exit>;
+/// The exit code of a command; `Err` if it stopped early, after its reason was printed.
+pub type CommandResult = Result<Exit, Exit>;
 
-/// Prints to stdout.
-pub fn say(text: &str) -> Ended {
+/// Prints to stdout as the last step of a command.
+pub fn say(text: &str) -> CommandResult {
     print(text).map(|()| Exit::Ok).map_err(|reason| fail(Exit::Failure, reason))
 }
 
-/// The exit code of a run, or a replay, that failed.
+/// Returns the exit code of a failed run or replay.
 pub fn exit_of(error: &LaunchError) -> Exit {
     match error {
         LaunchError::Died { .. } | LaunchError::StartUp { .. } | LaunchError::Hung { .. } => Exit::ProcessLost,

@@ -1,6 +1,6 @@
-//! `corotate record`: every sample of a running loop to a file, as `corotate run --record` starts it or by hand.
+//! `corotate record`: records every sample of a running loop. `corotate run --record` starts it too.
 
-use super::output::{Ended, Exit, Failure, fail, remark, say};
+use super::output::{CommandResult, Exit, Failure, fail, remark, say};
 use super::runs::{self, join};
 use crate::record::{RecordError, RecorderOptions, Recording, RecordingReport, run_recorder};
 use std::io::ErrorKind;
@@ -10,19 +10,19 @@ use std::path::{Path, PathBuf};
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The run: the directory that its results go to, or its domain [default: the newest run of this user]
+    /// The run's results directory or domain [default: your newest run]
     #[arg(long, value_name = "DIR")]
     domain: Option<PathBuf>,
-    /// The file to write
+    /// File to write
     #[arg(long, value_name = "FILE", default_value = "run.mcap")]
     out: PathBuf,
-    /// Replace a recording that is there
+    /// Replace an existing recording
     #[arg(long)]
     overwrite: bool,
-    /// Die with this process (the launcher gives its own id)
+    /// Die with this process (set by the launcher)
     #[arg(long, value_name = "PID", hide = true)]
     parent: Option<i32>,
-    /// Print what was recorded as one JSON object (corotate/record/v1)
+    /// Print counts as one JSON object (corotate/record/v1)
     #[arg(long)]
     json: bool,
 }
@@ -32,36 +32,36 @@ const SCHEMA: &str = "corotate/record/v1";
 
 const EXAMPLES: &str = "\
 Examples:
-  corotate run --record            record a run from its first tick to its last
-  corotate record --out part.mcap  the newest run that is under way, from now
-                                   on; Ctrl-C ends the recording in order
+  corotate run --record            a whole run, from the first tick to the last
+  corotate record --out part.mcap  your newest run, from now on; Ctrl-C closes
+                                   the recording
   corotate record --domain runs/pair
-                                   the run that `run --out runs/pair` began";
+                                   the run started by `run --out runs/pair`";
 
-/// Records to the end of the run.
-pub fn record(arguments: &Arguments) -> Ended {
-    let is_there = || std::fs::metadata(&arguments.out).is_ok_and(|file| file.is_file() && file.len() > 0);
-    if arguments.parent.is_none() && !arguments.overwrite && is_there() {
+/// Records a run to its end.
+pub fn record(arguments: &Arguments) -> CommandResult {
+    let exists = || std::fs::metadata(&arguments.out).is_ok_and(|file| file.is_file() && file.len() > 0);
+    if arguments.parent.is_none() && !arguments.overwrite && exists() {
         let file = arguments.out.display();
-        let reason = format!("{file} is there; name another file with --out, or give --overwrite");
+        let reason = format!("{file} exists; name another file with --out, or add --overwrite");
         return Err(fail(Exit::Usage, Failure::new("file-exists", reason)));
     }
     let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
     let options = RecorderOptions { domain, file: arguments.out.clone() };
     let report = run_recorder(&options, &terminated).map_err(|error| fail(exit_of(&error), error))?;
-    told(&report, arguments)
+    print_report(&report, arguments)
 }
 
-fn told(report: &RecordingReport, arguments: &Arguments) -> Ended {
-    let part = if report.whole { "" } else { ", from the midst of the run on" };
+fn print_report(report: &RecordingReport, arguments: &Arguments) -> CommandResult {
+    let part = if report.whole { "" } else { ", without the beginning of the run" };
     let text = if arguments.json {
         format!("{}\n", serde_json::json!({ "schema": SCHEMA, "recording": report }))
     } else {
         format!("{}: {} samples, {} bytes{part}\n", report.file, report.messages, report.bytes)
     };
-    let said = say(&text);
+    let printed = say(&text);
     if arguments.parent.is_none() {
-        said?;
+        printed?;
     }
     report
         .problem
@@ -69,7 +69,7 @@ fn told(report: &RecordingReport, arguments: &Arguments) -> Ended {
         .map_or(Ok(Exit::Ok), |problem| Err(fail(Exit::Failure, Failure::new("incomplete-recording", problem))))
 }
 
-/// Opens the recording of a run as [`open`] does. Returns it with its file.
+/// Opens the recording of a run like [`open`], and returns it with its file.
 ///
 /// # Errors
 /// The exit code, once the reason is printed.
@@ -79,17 +79,17 @@ pub fn open_run(run: Option<&Path>, accept_incomplete: bool) -> Result<(PathBuf,
     Ok((file, recording))
 }
 
-/// Opens a recording that is all there; another one too where the user says so, with a remark.
+/// Opens a recording. An incomplete or damaged one is an error unless `accept_incomplete`, then it is a remark.
 pub fn open(file: &Path, accept_incomplete: bool) -> Result<Recording, RecordError> {
     let recording = Recording::open(file)?;
     match recording.require_whole() {
         Err(error) if !accept_incomplete => return Err(error),
         Err(RecordError::Damaged { reason, .. }) => {
-            let text = format!("{} is damaged, and read as far as it can be believed: {reason}", file.display());
+            let text = format!("{} is damaged; only its intact part is read: {reason}", file.display());
             remark(&Failure::new("damaged-recording", text));
         }
         Err(RecordError::Incomplete { missing, .. }) => {
-            let text = format!("{} is not complete, and read as far as it goes: {missing}", file.display());
+            let text = format!("{} is incomplete; only what it contains is read: {missing}", file.display());
             remark(&Failure::new("incomplete-recording", text));
         }
         _ => {}
@@ -97,12 +97,12 @@ pub fn open(file: &Path, accept_incomplete: bool) -> Result<Recording, RecordErr
     Ok(recording)
 }
 
-/// The exit code of what was done with a recording: a damaged one is a failure, however much of it could be read.
+/// Returns `exit`, or `Failure` for a damaged recording.
 pub fn exit_with(recording: &Recording, exit: Exit) -> Exit {
     if recording.damage().is_some() { Exit::Failure } else { exit }
 }
 
-/// Whether it lies with the file, or with what was asked.
+/// Returns the exit code for an error: `Usage` if the user can correct the request.
 pub fn exit_of(error: &RecordError) -> Exit {
     match error {
         RecordError::Run(_)

@@ -1,6 +1,6 @@
-//! `corotate replay`: a recording through the live roles.
+//! `corotate replay`: feeds a recording to the roles and compares what they publish.
 
-use super::output::{Ended, Exit, Failure, fail, harmless, say};
+use super::output::{CommandResult, Exit, Failure, fail, harmless, say};
 use super::record::{exit_of, exit_with, open_run};
 use super::signals::catch_signals;
 use crate::launch::{LaunchError, replay_as_process};
@@ -16,13 +16,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 pub struct Arguments {
     /// A run's directory, a recording, or latest [default: runs/latest]
     run: Option<PathBuf>,
-    /// observer, controller, a body's name, or all
+    /// Replay observer, controller, a body by its name, or all
     #[arg(long, value_name = "ROLE", default_value = "all")]
     role: String,
-    /// Replay each role as a process of its own, as it takes part in runs, instead of in one thread
+    /// Replay each role in its own process, as in runs, not in one thread
     #[arg(long)]
     processes: bool,
-    /// Go on with what there is of a recording that is not complete
+    /// Accept an incomplete recording
     #[arg(long)]
     accept_incomplete: bool,
     /// Print one JSON object on stdout (corotate/replay/v1)
@@ -34,17 +34,17 @@ pub struct Arguments {
 const SCHEMA: &str = "corotate/replay/v1";
 
 const EXAMPLES: &str = "\
-Each role gets the inputs that it had, and misses what it missed; everything
-that it publishes but the time of sending is compared with what was recorded.
-Exit code 3 if anything differs. What cannot be told is said.
+Each role gets its recorded inputs, and misses the samples that it missed. All
+that it publishes, except times of sending, is compared with the recording. Exit
+code 3 if anything differs. Ticks that cannot be compared are printed.
 
 Examples:
-  corotate replay                  the newest run here, every role
+  corotate replay                  the newest run in runs/, all roles
   corotate replay runs/20261121T150000Z-rigid-pair
   corotate replay run.mcap --role observer --processes";
 
-/// Replays.
-pub fn replay(arguments: &Arguments) -> Ended {
+/// Executes `corotate replay`.
+pub fn replay(arguments: &Arguments) -> CommandResult {
     let (file, recording) = open_run(arguments.run.as_deref(), arguments.accept_incomplete)?;
     // In one thread a signal ends the process.
     let signal = arguments.processes.then(catch_signals).transpose().map_err(|error| fail(Exit::Failure, error))?;
@@ -54,11 +54,11 @@ pub fn replay(arguments: &Arguments) -> Ended {
     })?;
     let number = signal.map_or(0, |signal| signal.load(Ordering::Relaxed));
     if number != 0 {
-        let text = "ended by a signal before all was replayed";
+        let text = "a signal ended the replay before its end";
         return Err(fail(Exit::Signal(number), Failure::new("interrupted", text)));
     }
-    let words = || harmless(&replays.iter().map(words).collect::<String>());
-    say(&if arguments.json { json(&file, &replays) } else { words() })?;
+    let text = || harmless(&replays.iter().map(text).collect::<String>());
+    say(&if arguments.json { json(&file, &replays) } else { text() })?;
     let differs = replays.iter().any(|replay| replay.difference.is_some());
     Ok(exit_with(&recording, if differs { Exit::NotAccepted } else { Exit::Ok }))
 }
@@ -97,7 +97,7 @@ fn roles(name: &str, scenario: &Scenario) -> Result<Vec<RoleId>, RecordError> {
     })
 }
 
-/// All of it for programs.
+/// Returns the results as JSON.
 fn json(file: &Path, replays: &[RoleReplay]) -> String {
     let role = |replay: &RoleReplay| {
         let RoleReplay { role, ticks, lives, samples, difference, limit } = replay;
@@ -127,12 +127,12 @@ fn json(file: &Path, replays: &[RoleReplay]) -> String {
     format!("{}\n", serde_json::json!({ "schema": SCHEMA, "file": file, "same": same, "roles": roles }))
 }
 
-/// One role's replay for people.
-fn words(replay: &RoleReplay) -> String {
+/// Returns the result of one role as text.
+fn text(replay: &RoleReplay) -> String {
     let RoleReplay { role, ticks, lives, samples, difference, limit } = replay;
-    let lives = if *lives > 1 { format!(" in {lives} lives") } else { String::new() };
+    let lives = if *lives > 1 { format!(" in {lives} generations") } else { String::new() };
     let verdict = match difference {
-        None => "the same to the last bit".to_owned(),
+        None => "equal bit for bit".to_owned(),
         Some(first) => {
             let field = first.field.as_ref().map_or(String::new(), |field| format!(" {field}"));
             format!(
@@ -141,8 +141,8 @@ fn words(replay: &RoleReplay) -> String {
             )
         }
     };
-    let limit = limit.as_ref().map_or(String::new(), |limit| {
-        format!("  from tick {} on nothing can be compared: {}\n", limit.tick, limit.reason)
-    });
+    let limit = limit
+        .as_ref()
+        .map_or(String::new(), |limit| format!("  not compared from tick {}: {}\n", limit.tick, limit.reason));
     format!("{role}: {ticks} ticks{lives}, {samples} samples: {verdict}\n{limit}")
 }

@@ -1,6 +1,6 @@
-//! `corotate report`: a run, a recording, or a campaign as one page; or two runs over each other.
+//! `corotate report`: writes the page of a run, a recording, a campaign, or two runs.
 
-use super::output::{Ended, Exit, Failure, fail, remark, say};
+use super::output::{CommandResult, Exit, Failure, fail, remark, say};
 use super::record;
 use super::runs;
 use crate::campaign::JournalError;
@@ -17,57 +17,58 @@ use std::{fs, io};
 pub struct Arguments {
     /// A run's directory, a recording, or a campaign's directory [default: runs/latest]
     run: Option<PathBuf>,
-    /// Another, to be drawn over the first: the page shows both, and where they differ first
-    other: Option<PathBuf>,
-    /// The page to write [default: report.html in that directory, or beside the recording; of two runs, comparison.html here]
+    /// A second run, drawn over the first, with their first difference
+    #[arg(value_name = "OTHER")]
+    second: Option<PathBuf>,
+    /// Page to write [default: report.html beside the results; comparison.html here for two runs]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Show this field too, such as leader/estimate.omega_rad_s or one element of it, …[2]; again for more
+    /// Also draw this field, such as leader/estimate.omega_rad_s, or one element, …[2]; repeatable
     #[arg(long, value_name = "FIELD")]
     show: Vec<String>,
-    /// Write every figure as a picture of its own to this directory, as SVG
+    /// Write every figure to this directory, as SVG
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
     /// Show the page in a browser (xdg-open)
     #[arg(long)]
     open: bool,
-    /// Print where the page is as one JSON object (corotate/report/v1)
+    /// Print the page's path as one JSON object (corotate/report/v1)
     #[arg(long)]
     json: bool,
 }
 
 /// Layout version of the JSON.
 const SCHEMA: &str = "corotate/report/v1";
-/// How long a program that opens a page may take to say that it cannot.
+/// Time in which xdg-open must report an error.
 const OPENING: Duration = Duration::from_secs(2);
 
 const EXAMPLES: &str = "\
-The page needs no network; it is light or dark as the reader's screen is, and
-prints. In pictures over time, drag to look at a part, double click for all. Motion, errors over time and lateness over time are drawn
-from the recording; without one the page has the rest and says so.
+The page needs no network, is light or dark like the desktop, and can be
+printed. In charts over time, drag to zoom; double-click resets. Motion, errors
+and lateness over time need a recording.
 
 Examples:
   corotate run rigid-pair --record --out runs/pair
-  corotate report --open           the newest run here, in a browser
+  corotate report --open           the newest run in runs/, in a browser
   corotate report runs/pair        runs/pair/report.html
   corotate report runs/pair/run.mcap --out motion.html
                                    the recording alone
   corotate report runs/map         a campaign: maps, margins, worst cases
   corotate report runs/before runs/after
-                                   both over each other, in comparison.html";
+                                   both in the same charts: comparison.html";
 
-/// Makes the page.
-pub fn report(arguments: &Arguments) -> Ended {
+/// Writes the page.
+pub fn report(arguments: &Arguments) -> CommandResult {
     let source = runs::results(arguments.run.as_deref()).map_err(|failure| fail(Exit::Usage, failure))?;
     let directory = if source.is_dir() { &source } else { source.parent().unwrap_or(Path::new("")) };
-    let page = if arguments.other.is_some() { "comparison.html".into() } else { directory.join("report.html") };
+    let page = if arguments.second.is_some() { "comparison.html".into() } else { directory.join("report.html") };
     let out = arguments.out.clone().unwrap_or(page);
     // Drawn on stderr, and only if that is a terminal.
     let spinner = ProgressBar::new_spinner().with_message(format!("reading {}", source.display()));
     spinner.enable_steady_tick(Duration::from_millis(100));
-    let composed = match &arguments.other {
+    let composed = match &arguments.second {
         None => compose(&source, &arguments.show),
-        Some(other) => report_pair(&source, other, &arguments.show),
+        Some(second) => report_pair(&source, second, &arguments.show),
     };
     spinner.finish_and_clear();
     let written = composed.and_then(|report| {
@@ -85,7 +86,7 @@ fn words(json: bool, out: &Path) -> String {
     if json { format!("{}\n", serde_json::json!({ "schema": SCHEMA, "page": page })) } else { page + "\n" }
 }
 
-/// Shows the page, if that is asked for, in whatever this desktop opens pages with.
+/// Opens the page with xdg-open, if wanted.
 fn show(wanted: bool, page: &Path) -> Result<(), Exit> {
     let open = || -> io::Result<()> {
         let mut opener = Command::new("xdg-open")
@@ -94,7 +95,7 @@ fn show(wanted: bool, page: &Path) -> Result<(), Exit> {
             .stdout(Stdio::null())
             .stderr(Stdio::null())
             .spawn()?;
-        // A browser that it becomes stays; one that is not there is told at once.
+        // xdg-open may become the browser and keep running; it reports a missing browser at once.
         let end = Instant::now() + OPENING;
         while Instant::now() < end {
             match opener.try_wait()? {
@@ -106,7 +107,7 @@ fn show(wanted: bool, page: &Path) -> Result<(), Exit> {
         Ok(())
     };
     let failed = |error| {
-        let reason = format!("xdg-open: {error}; open {} in a browser", page.display());
+        let reason = format!("cannot open a browser: xdg-open: {error}; open {} yourself", page.display());
         fail(Exit::Failure, Failure::new("no-browser", reason))
     };
     if wanted { open().map_err(failed) } else { Ok(()) }

@@ -1,6 +1,6 @@
-//! `corotate plant|observer|controller`: one role, as the launcher starts it.
+//! `corotate plant|observer|controller`: runs one role; the launcher starts roles by it.
 
-use super::output::{Ended, Exit, fail};
+use super::output::{CommandResult, Exit, fail};
 use super::runs::join;
 use crate::seat::{RoleAddress, RoleError, run_role};
 use std::path::PathBuf;
@@ -9,10 +9,10 @@ use std::path::PathBuf;
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The run: its domain, as `corotate run --external ROLE` prints it, or the directory that its results go to [default: the newest run of this user]
+    /// The run's domain or results directory; `run --external ROLE` prints the domain [default: your newest run]
     #[arg(long, value_name = "DIR")]
     domain: Option<PathBuf>,
-    /// Die with this process (the launcher gives its own id)
+    /// Die with this process (set by the launcher)
     #[arg(long, value_name = "PID", hide = true)]
     parent: Option<i32>,
 }
@@ -20,7 +20,7 @@ pub struct Arguments {
 const EXAMPLES: &str = "\
 Example:
   corotate run pair.toml --external ROLE
-                                   prints the line to type, with the domain";
+                                   prints the command to type, with the domain";
 
 /// Options of `corotate plant`.
 #[derive(clap::Args)]
@@ -30,14 +30,14 @@ pub struct PlantArguments {
     #[arg(long, value_name = "NAME")]
     pub body: String,
     #[command(flatten)]
-    pub seat: Arguments,
+    pub role: Arguments,
 }
 
-/// Serves a role to the end of the run.
-pub fn role(name: &str, arguments: &Arguments) -> Ended {
+/// Runs a role to the end of the run.
+pub fn role(name: &str, arguments: &Arguments) -> CommandResult {
     let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
-    let seat = RoleAddress { domain, role: name.to_owned() };
-    run_role(&seat, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
+    let address = RoleAddress { domain, role: name.to_owned() };
+    run_role(&address, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
         RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::Hosted { .. } => {
             fail(Exit::Usage, error)
         }

@@ -1,4 +1,4 @@
-//! `corotate run`: one scenario from file to verdict.
+//! `corotate run`: runs a scenario and prints its verdict.
 
 use super::campaign;
 use super::color::{Color, paint};
@@ -34,10 +34,10 @@ pub struct Arguments {
     /// A shipped scenario's name, a file (x.toml, ./x), or - for stdin
     #[arg(value_name = "SCENARIO")]
     file: Option<PathBuf>,
-    /// Run this case of a campaign; SCENARIO is the campaign's name or file
+    /// Run this case of a campaign; SCENARIO is the campaign
     #[arg(long, value_name = "N", requires = "file")]
     case: Option<u64>,
-    /// What drives the ticks
+    /// Clock of the ticks
     #[arg(long, value_name = "CLOCK", value_parser = ["realtime", "lockstep", "in-process"])]
     clock: Option<String>,
     /// Length of the run, s
@@ -46,22 +46,22 @@ pub struct Arguments {
     /// Ticks per second, Hz
     #[arg(long, value_name = "HZ", allow_negative_numbers = true)]
     tick_hz: Option<String>,
-    /// Override a key, as leader.measured_axes=[1,3]
+    /// Override a key, such as leader.measured_axes=[1,3]
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Directory for the results [default: runs/<utc>-<name>]
+    /// Directory of the results [default: runs/<utc>-<name>]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Remove the files of an earlier run from the directory for the results
+    /// Remove the files of an earlier run from --out
     #[arg(long, requires = "out", hide_short_help = true)]
     overwrite: bool,
-    /// Do not run without every privilege that the scenario asks for
+    /// Fail unless all requested real-time privileges are granted
     #[arg(long, hide_short_help = true)]
     require_rt: bool,
-    /// Do not start this role: wait for somebody else to
+    /// Do not start this role; wait for one started by hand
     #[arg(long, value_name = "ROLE")]
     external: Vec<String>,
-    /// Print this role's process before the first tick, and wait for a debugger that continues it (several: a,b)
+    /// Print this role's process and wait for a debugger before the first tick; several: a,b
     #[arg(long, value_name = "ROLE", value_parser = role_list, hide_short_help = true)]
     debug: Option<String>,
     /// Write the verdict as JUnit XML, one test case per criterion
@@ -70,54 +70,52 @@ pub struct Arguments {
     /// Record every sample to run.mcap beside the results
     #[arg(long)]
     record: bool,
-    /// Show every signal live on a Foxglove WebSocket, at IP:PORT; without ADDR at 127.0.0.1:8765
+    /// Serve all signals to Foxglove (WebSocket) at IP:PORT; without ADDR at 127.0.0.1:8765
     #[arg(long, hide_short_help = true, value_name = "ADDR", num_args = 0..=1, default_missing_value = foxglove::ADDRESS, value_parser = foxglove::address)]
     foxglove: Option<SocketAddr>,
-    /// Be this host of the scenario's, and wait for the others to join
+    /// Be this host of the scenario, and wait for the others to join
     #[arg(long, value_name = "NAME", requires = "listen", hide_short_help = true)]
     host: Option<String>,
-    /// Where the others join: quic/HOST:PORT, or tcp/ or udp/ on loopback
+    /// Address for the others: quic/HOST:PORT, or tcp/ or udp/ on loopback
     #[arg(long, value_name = "ADDR", requires = "host", hide_short_help = true)]
     listen: Option<Address>,
     #[command(flatten)]
     keys: KeyArguments,
-    /// Print the summary as JSON, all else on stderr
+    /// Print the summary as JSON, everything else to stderr
     #[arg(long)]
     json: bool,
-    /// Tell programs what happens, on stdout, each event as one line of JSON (corotate/event/v1)
+    /// Print events as lines of JSON (corotate/event/v1)
     #[arg(long, conflicts_with = "json")]
     events: bool,
-    /// Print nothing but errors and the last line
+    /// Print only errors and the last line
     #[arg(short, long, conflicts_with = "verbose")]
     quiet: bool,
-    /// Print the whole table, and on stderr the phases
+    /// Print the full table, and phases to stderr
     #[arg(short, long)]
     verbose: bool,
 }
 
 const EXAMPLES: &str = "\
-A name always means the scenario that ships with the program, as
-`corotate init --list` tells them; a file in this directory is meant by ./NAME
-or NAME.toml. runs/latest leads to the newest run in runs/.
+A name selects a shipped scenario; `corotate init --list` prints all. Give a file
+in this directory as ./NAME or NAME.toml. runs/latest links to the newest run.
 
-The last line is PASS if every criterion of [accept] that was judged holds, FAIL
-if one does not or the run was not sound, NOT JUDGED if nothing was broken but
-the run is no proof: no criteria, stopped, shorter than settled_by_s, not scored.
-It names ticks that roles missed, starved or were safe at. It ends the table on
-stdout; with --json it is on stderr. A run that could not begin has an error.
+The last line is the verdict. PASS: all judged criteria of [accept] hold. FAIL: a
+criterion does not hold, or the run failed. NOT JUDGED: the run proves nothing,
+for it has no criteria or no score, was stopped, or is shorter than settled_by_s.
+The line counts missed, starved and safe ticks. It is on stdout; with --json on
+stderr. If the run could not begin, an error takes its place.
 
 Examples:
-  corotate run rigid-trio          a scenario that ships with the program
-  corotate run pair.toml           a file: four processes in real time; a table,
-                                   and runs/<utc>-<name>/
+  corotate run rigid-trio          a shipped scenario
+  corotate run pair.toml           a file; results in runs/<utc>-<name>/
   corotate init rigid-pair | corotate run - --clock lockstep
-                                   as fast as the machine goes, the same bits
+                                   as fast as possible, with the same results
   corotate run pair.toml --record --set follower.0.initial_rate_rad_s=[1,0,0]
-                                   every sample to run.mcap, another start
+                                   record every sample, change the start
   corotate run pair.toml --external follower
-                                   wait for hardware in the follower's seat
+                                   wait for hardware as the follower
   corotate run pair.toml --junit verdict.xml --require-rt
-                                   as a test, where real time is granted";
+                                   as a test, with real time required";
 
 impl Arguments {
     fn changes(&self) -> impl Iterator<Item = Change<'_>> {
@@ -134,7 +132,7 @@ impl Arguments {
         self.set.iter().map(|argument| Change::Set(argument)).chain(named).chain(record)
     }
 
-    fn scenario(&self) -> Result<Scenario, Failed> {
+    fn scenario(&self) -> Result<Scenario, RunFailure> {
         let loaded = match (self.case, &self.file) {
             (Some(case), Some(file)) => campaign::load(file, &[]).and_then(|campaign| {
                 let document = campaign::case(&campaign, case)?;
@@ -142,7 +140,7 @@ impl Arguments {
             }),
             _ => load(self.file.as_deref(), self.changes()),
         };
-        let unusable = |failure| Failed { exit: Exit::Usage, failure };
+        let unusable = |failure| RunFailure { exit: Exit::Usage, failure };
         let scenario = loaded.map_err(unusable)?;
         self.check_external(&scenario)
             .and_then(|()| self.check_foxglove(&scenario))
@@ -153,18 +151,18 @@ impl Arguments {
     }
 
     fn check_foxglove(&self, scenario: &Scenario) -> Result<(), Failure> {
-        let in_thread = "a run in one thread has nothing that another process could show; take --clock lockstep";
+        let in_thread = "not possible with the clock in-process; use --clock lockstep";
         let in_thread = (scenario.clock == ClockKind::InProcess).then_some(("one-process", in_thread));
         let refused = foxglove::refusal().map(|reason| ("built-without", reason)).or(in_thread);
         let refused = refused.filter(|_| self.foxglove.is_some());
         refused.map_or(Ok(()), |(code, reason)| Err(Failure::new(code, format!("--foxglove: {reason}"))))
     }
 
-    /// This host's part in a run over several.
+    /// Returns this host's part in a run over several hosts.
     fn seat(&self) -> Result<Option<HostEndpoint>, Failure> {
         let (Some(host), Some(address)) = (&self.host, &self.listen) else {
             return if self.keys.any() {
-                Err(Failure::new("unused-keys", "--tls-… and --insecure are for --listen"))
+                Err(Failure::new("unused-keys", "--tls-… and --insecure need --listen; add it, or leave them out"))
             } else {
                 Ok(None)
             };
@@ -179,22 +177,25 @@ impl Arguments {
         hosts::refusal().map_or(Ok(()), |reason| refuse("built-without", reason.to_owned()))?;
         let names: Vec<&str> = scenario.hosts.hosts.iter().map(|host| &*host.name).collect();
         if scenario.clock == ClockKind::InProcess {
-            return refuse("one-process", "one thread has one host; give --clock realtime or lockstep".to_owned());
+            return refuse(
+                "one-process",
+                "not possible with the clock in-process; use --clock realtime or lockstep".to_owned(),
+            );
         }
         if !self.external.is_empty() {
-            let reason = "somebody else's role has no part in a run over several hosts; leave it out, or --external";
+            let reason = "external roles are not possible in a run over several hosts; leave out --external or --host";
             return refuse("external-with-hosts", reason.to_owned());
         }
         if let Some(role) = scenario.debug.iter().find(|role| scenario.hosts.host_of(role) != Some(&host)) {
-            let reason = format!("the {role} of launch.debug is on another host; debug the roles of this one");
+            let reason = format!("launch.debug names {role}, which runs on another host; name roles of this host");
             return refuse("debugged-elsewhere", reason);
         }
         match names.contains(&host.as_str()) {
             true => Ok(()),
             false if names.is_empty() => {
-                refuse("no-hosts", "the scenario has no [[host]]; name hosts and their roles there".to_owned())
+                refuse("no-hosts", "the scenario has no hosts; add [[host]] tables with their roles".to_owned())
             }
-            false => refuse("no-such-host", format!("the scenario has no such host; it has: {}", names.join(", "))),
+            false => refuse("no-such-host", format!("the scenario has no such host; choose from {}", names.join(", "))),
         }
     }
 
@@ -207,31 +208,31 @@ impl Arguments {
     }
 }
 
-/// Returns names that commas separate as a list of a scenario file.
+/// Returns names separated by commas as a list in TOML.
 fn role_list(names: &str) -> Result<String, std::convert::Infallible> {
     let names: Vec<String> = names.split(',').map(|name| format!("{:?}", name.trim())).collect();
     Ok(format!("[{}]", names.join(", ")))
 }
 
-/// Why a run has no verdict.
-struct Failed {
+/// The reason why a run has no verdict.
+struct RunFailure {
     exit: Exit,
     failure: Failure,
 }
 
-impl Failed {
+impl RunFailure {
     fn new(exit: Exit, error: impl Into<Failure>) -> Self {
         Self { exit, failure: error.into() }
     }
 }
 
-/// Runs a scenario.
+/// Executes `corotate run`.
 pub fn run(arguments: &Arguments) -> Exit {
     let run = match new_run() {
         Ok(run) => run,
         Err(error) => {
-            let reason = "a sandbox may forbid getrandom: allow it";
-            let reason = format!("the run gets no identifier: no random numbers: {error}; {reason}");
+            let remedy = "if a sandbox forbids getrandom, allow it";
+            let reason = format!("cannot create the run's identifier: no random numbers: {error}; {remedy}");
             return fail(Exit::Failure, Failure::new("no-random-numbers", reason));
         }
     };
@@ -240,50 +241,51 @@ pub fn run(arguments: &Arguments) -> Exit {
         scenario
     });
     let name = loaded.as_ref().map_or_else(|_| stem(arguments.file.as_deref()), |scenario| scenario.name.clone());
-    let write_verdict = |ended| arguments.junit.as_deref().map_or(Ok(()), |path| write_junit(path, &name, run, ended));
-    // Whoever reads the file finds no older verdict, however this run ends.
-    if let Err(exit) = write_verdict(Err("the run did not come to an end")) {
+    let write_verdict =
+        |result| arguments.junit.as_deref().map_or(Ok(()), |path| write_junit(path, &name, run, result));
+    // Replaces an older verdict, in case this process is killed.
+    if let Err(exit) = write_verdict(Err("the run did not finish")) {
         return exit;
     }
-    let ended = loaded.and_then(|scenario| attempt(arguments, &scenario));
-    let told = ended.as_ref().map(|(summary, _)| summary);
-    let reason = ended.as_ref().err().map(|failed| failed.failure.to_string()).unwrap_or_default();
-    let written = write_verdict(told.map_err(|_| reason.as_str()));
-    let exit = match ended {
+    let result = loaded.and_then(|scenario| attempt(arguments, &scenario));
+    let summary = result.as_ref().map(|(summary, _)| summary);
+    let reason = result.as_ref().err().map(|failed| failed.failure.to_string()).unwrap_or_default();
+    let written = write_verdict(summary.map_err(|_| reason.as_str()));
+    let exit = match result {
         Ok((summary, _)) => {
-            let verdict = Verdict::of(&summary);
-            verdict.tell(arguments).map_or_else(|error| fail(Exit::Failure, error), |()| verdict.exit)
+            let verdict = Verdict::new(&summary);
+            verdict.print(arguments).map_or_else(|error| fail(Exit::Failure, error), |()| verdict.exit)
         }
-        Err(Failed { exit, failure }) => fail(exit, failure),
+        Err(RunFailure { exit, failure }) => fail(exit, failure),
     };
     match (written, exit) {
-        (Err(failed), Exit::Ok) => failed,
+        (Err(failure), Exit::Ok) => failure,
         _ => exit,
     }
 }
 
-fn write_junit(path: &Path, name: &str, run: RunId, ended: Result<&Summary, &str>) -> Result<(), Exit> {
+fn write_junit(path: &Path, name: &str, run: RunId, result: Result<&Summary, &str>) -> Result<(), Exit> {
     let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty());
     let made = directory.map_or(Ok(()), files::create_directories);
-    made.and_then(|()| files::write(path, junit(name, run, ended).as_bytes()))
-        .map_err(|error| format!("{}: {error}; name another file with --junit", path.display()))
+    made.and_then(|()| files::write(path, junit(name, run, result).as_bytes()))
+        .map_err(|error| format!("cannot write {}: {error}; name another file with --junit", path.display()))
         .map_err(|reason| fail(Exit::Failure, Failure::new("cannot-write", reason)))
 }
 
-/// Runs a scenario, and writes and tells what came of it. The outcome is given too: it holds what is still to be removed.
-fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outcome), Failed> {
-    let broken = |failure: Failure| Failed { exit: Exit::Failure, failure };
+/// Runs a scenario, writes its results and prints its table. The returned outcome owns files that are removed on drop.
+fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outcome), RunFailure> {
+    let broken = |failure: Failure| RunFailure { exit: Exit::Failure, failure };
     let unwritten = |error: &dyn std::fmt::Display| {
         broken(Failure::new("cannot-write", format!("{error}; name another directory with --out")))
     };
     let started = SystemTime::now();
     let directory =
         make_directory(arguments.out.as_deref(), &scenario.name, started).map_err(|error| unwritten(&error))?;
-    let run = scenario.run.expect("it was given before");
-    // Kept to the end: no other run writes to the directory meanwhile.
+    let run = scenario.run.expect("the caller has set it");
+    // Held to the end, so that no other run writes to the directory.
     let claim = claim(&directory, run, arguments.overwrite).map_err(|error| match error {
-        ResultsError::Directory { .. } => Failed::new(Exit::Failure, error),
-        _ => Failed::new(Exit::Usage, error),
+        ResultsError::Directory { .. } => RunFailure::new(Exit::Failure, error),
+        _ => RunFailure::new(Exit::Usage, error),
     })?;
     if let Some(names) = claim.removed_names().filter(|_| !arguments.quiet) {
         remark(&format!("removed from {}: {names}", directory.display()));
@@ -291,12 +293,13 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
     let signal = catch_signals().map_err(broken)?;
     let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
     let fleets = fleets.map(|body| body.name.to_string()).collect();
-    let (level, events) = (Level::of(arguments), arguments.events);
-    let joins = arguments.listen.as_ref().map(|address| arguments.keys.join_words(address));
-    let mut screen = Screen { bar: None, asked: false, fleets, level, told: String::new(), events, joins };
-    screen.tell_verbose(format_args!("results go to {}", directory.display()));
-    if scenario.clock == ClockKind::Realtime && screen.level > Level::Quiet {
-        tell_ungranted(scenario);
+    let (level, events) = (Verbosity::new(arguments), arguments.events);
+    let join_command = arguments.listen.as_ref().map(|address| arguments.keys.join_command(address));
+    let mut screen =
+        Screen { bar: None, instructed: false, fleets, level, last_phase: String::new(), events, join_command };
+    screen.print_verbose(format_args!("results go to {}", directory.display()));
+    if scenario.clock == ClockKind::Realtime && screen.level > Verbosity::Quiet {
+        warn_ungranted(scenario);
     }
     let outcome = crate::launch::run(
         scenario,
@@ -305,7 +308,7 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
             record: scenario.record.then(|| directory.join("run.mcap")),
             results: std::fs::canonicalize(&directory).ok(),
             foxglove: arguments.foxglove,
-            host: arguments.seat().map_err(|failure| Failed { exit: Exit::Usage, failure })?,
+            host: arguments.seat().map_err(|failure| RunFailure { exit: Exit::Usage, failure })?,
             require_realtime: arguments.require_rt,
             checkpoints: true,
             signal: &signal,
@@ -313,23 +316,22 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
         },
     );
     screen.clear();
-    let outcome = outcome.map_err(|error| Failed::new(exit_of(&error), error))?;
+    let outcome = outcome.map_err(|error| RunFailure::new(exit_of(&error), error))?;
     let summary = Summary::new(scenario, &outcome, started);
     let written = write_run(&directory, scenario, &summary);
     let reported = report(arguments, &summary, &directory);
     written.map_err(|error| unwritten(&format_args!("cannot write the results: {error}")))?;
     if let Err(error) = make_latest(&directory) {
-        remark(&format!("runs/latest does not lead to this run: {error}; name {} instead", directory.display()));
+        remark(&format!("runs/latest does not link to this run: {error}; name {} instead", directory.display()));
     }
     reported.map_err(broken)?;
     Ok((summary, outcome))
 }
 
-/// Tells in a line what the machine will not grant, and the command that changes it: before the run, because its deadlines are
-/// missed for it.
-fn tell_ungranted(scenario: &Scenario) {
+/// Prints the privileges that the machine does not grant, with a remedy, because the run may miss deadlines without them.
+fn warn_ungranted(scenario: &Scenario) {
     if let Some((lacking, command)) = Machine::at(Path::new("/")).ungranted(&scenario.realtime) {
-        let text = format!("not granted: {lacking}; this shell is granted it by `{command}`");
+        let text = format!("not granted: {lacking}; to grant it to this shell, run `{command}`");
         remark(&Failure::new("not-granted", text));
     } else if scenario.realtime.priority > 0
         && let Some(error) = refused_priority(scenario.realtime.priority)
@@ -359,7 +361,7 @@ fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<
     }
 }
 
-/// What a run that came to an end is judged: its exit code, and its last line.
+/// The verdict of a finished run: exit code and last line.
 struct Verdict {
     exit: Exit,
     word: (&'static str, Color),
@@ -367,12 +369,12 @@ struct Verdict {
 }
 
 impl Verdict {
-    fn new(exit: Exit, word: (&'static str, Color), reason: impl Into<String>) -> Self {
+    fn with(exit: Exit, word: (&'static str, Color), reason: impl Into<String>) -> Self {
         Self { exit, word, reason: reason.into() }
     }
 
-    /// Judges a run, and says on stderr what is wrong with it. Ticks that were missed, starved or safe are always named.
-    fn of(summary: &Summary) -> Self {
+    /// Judges a run and prints its problems to stderr. The reason always counts missed, starved and safe ticks.
+    fn new(summary: &Summary) -> Self {
         let verdict = Self::without_ticks(summary);
         let ticks = tick_words(&summary.books);
         let reason = if ticks.is_empty() { verdict.reason } else { format!("{}; {ticks}", verdict.reason) };
@@ -385,31 +387,31 @@ impl Verdict {
                 Exit::Failure,
                 Failure::new("unbalanced", "the counters do not balance: samples or ticks are unaccounted for"),
             );
-            return Self::new(exit, FAIL, "the counters do not balance");
+            return Self::with(exit, FAIL, "the counters do not balance");
         }
         if let Some(stopped) = summary.incidents.iter().find(|incident| incident.action == Action::Stopped) {
-            // A run in one thread has printed nothing yet.
+            // A run in one thread has not printed it yet.
             if stopped.panic.is_some() && summary.clock == "in-process" {
                 remark(stopped);
             }
             let why = stopped.panic.as_ref().map_or(String::new(), |panic| format!(": {panic}"));
-            return Self::new(Exit::ProcessLost, FAIL, format!("the {} was lost{why}", stopped.role));
+            return Self::with(Exit::ProcessLost, FAIL, format!("the role {} was lost{why}", stopped.role));
         }
         if let Some(problem) = summary.recording.as_ref().and_then(|recording| recording.problem.as_ref()) {
             let exit = fail(
                 Exit::Failure,
-                Failure::new("incomplete-recording", format!("the recording is not complete: {problem}")),
+                Failure::new("incomplete-recording", format!("the recording is incomplete: {problem}")),
             );
-            return Self::new(exit, FAIL, "the recording is not complete");
+            return Self::with(exit, FAIL, "the recording is incomplete");
         }
         let broken: Vec<_> = summary.criteria.iter().filter(|criterion| criterion.holds == Some(false)).collect();
         for criterion in &broken {
-            let value = criterion.value.map_or("nothing was measured".to_owned(), exact);
+            let value = criterion.value.map_or("not measured".to_owned(), exact);
             let role = criterion.role.as_ref().map_or(String::new(), |role| format!("{role}: "));
             let text = format!("accept.{}: {role}{value}, limit {}", criterion.name, exact(criterion.limit));
             remark(&Failure::new("not-met", text));
         }
-        let ended = (summary.signal != 0).then(|| format!("ended in order by signal {}", summary.signal));
+        let ended = (summary.signal != 0).then(|| format!("stopped by signal {}", summary.signal));
         ended.iter().for_each(|ended| remark(&Failure::new("interrupted", ended)));
         let signal = (summary.signal != 0).then_some(Exit::Signal(summary.signal));
         match summary.accepted {
@@ -419,21 +421,21 @@ impl Verdict {
                     0 => String::new(),
                     left => format!(", {left} not judged"),
                 };
-                Self::new(signal.unwrap_or(Exit::Ok), PASS, format!("{}{left}", counted(held, "holds", "hold")))
+                Self::with(signal.unwrap_or(Exit::Ok), PASS, format!("{}{left}", counted(held, "holds", "hold")))
             }
             Some(false) => {
                 let reason = format!("{} of {} not met", broken.len(), counted(summary.criteria.len(), "", ""));
-                Self::new(signal.unwrap_or(Exit::NotAccepted), FAIL, reason)
+                Self::with(signal.unwrap_or(Exit::NotAccepted), FAIL, reason)
             }
             None => {
                 let reason = summary.verdict.strip_prefix("not judged: ").unwrap_or(&summary.verdict);
-                Self::new(signal.unwrap_or(Exit::Ok), NOT_JUDGED, ended.as_deref().unwrap_or(reason))
+                Self::with(signal.unwrap_or(Exit::Ok), NOT_JUDGED, ended.as_deref().unwrap_or(reason))
             }
         }
     }
 
-    /// Prints the last line where the table is.
-    fn tell(&self, arguments: &Arguments) -> Result<(), Failure> {
+    /// Prints the last line to the stream of the table.
+    fn print(&self, arguments: &Arguments) -> Result<(), Failure> {
         let (word, color) = self.word;
         if arguments.events {
             event("verdict", serde_json::json!({ "word": word, "reason": self.reason, "exit": self.exit.code() }))?;
@@ -450,32 +452,32 @@ const PASS: (&str, Color) = ("PASS", Color::Green);
 const FAIL: (&str, Color) = ("FAIL", Color::Red);
 const NOT_JUDGED: (&str, Color) = ("NOT JUDGED", Color::Yellow);
 
-/// So many criteria, with the verb that goes with the number.
-fn counted(count: usize, one: &str, many: &str) -> String {
-    let text = if count == 1 { format!("1 criterion {one}") } else { format!("{count} criteria {many}") };
+/// Returns the number of criteria with a verb in singular or plural.
+fn counted(count: usize, singular: &str, plural: &str) -> String {
+    let text = if count == 1 { format!("1 criterion {singular}") } else { format!("{count} criteria {plural}") };
     text.trim_end().to_owned()
 }
 
-/// Tells programs of one thing that happened: a line of JSON.
-fn event(what: &str, mut about: serde_json::Value) -> Result<(), Failure> {
-    about["schema"] = "corotate/event/v1".into();
-    about["event"] = what.into();
-    print(&format!("{about}\n"))
+/// Prints an event as a line of JSON.
+fn event(name: &str, mut fields: serde_json::Value) -> Result<(), Failure> {
+    fields["schema"] = "corotate/event/v1".into();
+    fields["event"] = name.into();
+    print(&format!("{fields}\n"))
 }
 
-/// How much is said of a run while it goes on.
+/// The amount of output during a run.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Level {
+enum Verbosity {
     /// Nothing.
     Quiet,
-    /// Progress on a terminal, and what a person must do.
+    /// A progress bar on a terminal, and instructions for the user.
     Usual,
-    /// Where it is, and each of its phases.
+    /// Also the directory and the phases.
     Verbose,
 }
 
-impl Level {
-    fn of(arguments: &Arguments) -> Self {
+impl Verbosity {
+    fn new(arguments: &Arguments) -> Self {
         match arguments {
             Arguments { quiet: true, .. } => Self::Quiet,
             Arguments { verbose: true, .. } => Self::Verbose,
@@ -484,39 +486,40 @@ impl Level {
     }
 }
 
-/// Progress on a terminal; silence elsewhere, but for what a person must do, or asked to be told.
+/// Output during a run: a progress bar on a terminal, instructions, phases and events.
 struct Screen {
     bar: Option<ProgressBar>,
-    asked: bool,
-    /// The bodies that are many, and that no device can be.
+    /// True once the user has instructions for missing roles or hosts.
+    instructed: bool,
+    /// Bodies that are fleets; a device cannot replace them.
     fleets: Vec<String>,
-    level: Level,
-    /// What was told last of the phases.
-    told: String,
-    /// Whether programs are told, too.
+    level: Verbosity,
+    /// The last printed phase.
+    last_phase: String,
+    /// True if events are printed.
     events: bool,
-    /// What is typed on another host to join, but for its name; where others can.
-    joins: Option<String>,
+    /// The command by which other hosts join, without the host's name.
+    join_command: Option<String>,
 }
 
 impl Screen {
     fn show(&mut self, progress: &Progress<'_>) {
-        self.tell_phase(progress);
+        self.print_phase(progress);
         match progress {
-            _ if self.level == Level::Quiet => {}
-            Progress::Waiting { hosts, .. } if !hosts.is_empty() && !self.asked => {
-                self.asked = true;
-                let joins = self.joins.as_deref().unwrap_or_default();
+            _ if self.level == Verbosity::Quiet => {}
+            Progress::Waiting { hosts, .. } if !hosts.is_empty() && !self.instructed => {
+                self.instructed = true;
+                let join_command = self.join_command.as_deref().unwrap_or_default();
                 for host in hosts {
-                    tell(format_args!("waiting for the host {host}: type there\n  {} {joins} --host {host}", name()));
+                    tell(format_args!("waiting for host {host}: run there\n  {} {join_command} --host {host}", name()));
                 }
             }
-            Progress::Waiting { external, domain, .. } if !external.is_empty() && !self.asked => {
-                self.asked = true;
+            Progress::Waiting { external, domain, .. } if !external.is_empty() && !self.instructed => {
+                self.instructed = true;
                 for role in external {
                     tell(format_args!("waiting for {role}: start it with\n  {}", self.by_hand(role, domain)));
                     let seat = seat_path(domain, role);
-                    tell(format_args!("or give a program of your own the seat\n  {}", seat.display()));
+                    tell(format_args!("or pass this seat to your own program\n  {}", seat.display()));
                 }
             }
             Progress::Waiting { .. } => {}
@@ -532,21 +535,21 @@ impl Screen {
         }
     }
 
-    /// Tells each phase of a run once, to whoever wants to know.
-    fn tell_phase(&mut self, progress: &Progress<'_>) {
+    /// Prints each phase of a run once, as text with `--verbose` and as events.
+    fn print_phase(&mut self, progress: &Progress<'_>) {
         let phase = match progress {
             Progress::Waiting { domain, hosts, .. } if !hosts.is_empty() => {
-                format!("the run's domain is {}; it waits for {}", domain.display(), hosts.join(", "))
+                format!("the run's domain is {}; waiting for {}", domain.display(), hosts.join(", "))
             }
             Progress::Waiting { domain, .. } => format!("the run's domain is {}", domain.display()),
-            Progress::Running { last_tick, .. } => format!("ticks 0 to {last_tick} run"),
+            Progress::Running { last_tick, .. } => format!("running ticks 0 to {last_tick}"),
             Progress::External(_) => return,
         };
-        if phase != self.told {
-            self.tell_verbose(format_args!("{phase}"));
-            self.told = phase;
+        if phase != self.last_phase {
+            self.print_verbose(format_args!("{phase}"));
+            self.last_phase = phase;
             if self.events {
-                // A reader that has gone is told of at the end, when what it lacks is most.
+                // A failure to print is reported at the end of the run.
                 let _ = match progress {
                     Progress::Waiting { external, domain, hosts, .. } => {
                         let seat = |role: &&str| (role.to_string(), seat_path(domain, role));
@@ -562,8 +565,8 @@ impl Screen {
         }
     }
 
-    fn tell_verbose(&self, words: std::fmt::Arguments<'_>) {
-        if self.level == Level::Verbose {
+    fn print_verbose(&self, words: std::fmt::Arguments<'_>) {
+        if self.level == Verbosity::Verbose {
             remark(&words);
         }
     }
@@ -573,14 +576,14 @@ impl Screen {
         match role {
             "observer" | "controller" if !self.fleets.is_empty() => format!("{name} {role} --domain {domain}"),
             "observer" | "controller" => format!(
-                "{name} {role} --domain {domain}\nor put a device there with\n  \
+                "{name} {role} --domain {domain}\nor connect a device with\n  \
                  {name} bridge --serial PATH --role {role} --domain {domain}"
             ),
             body if body == "leader" || self.fleets.iter().any(|fleet| fleet == body) => {
                 format!("{name} plant --body {body} --domain {domain}")
             }
             body => format!(
-                "{name} plant --body {body} --domain {domain}\nor put a device there with\n  \
+                "{name} plant --body {body} --domain {domain}\nor connect a device with\n  \
                  {name} bridge --serial PATH --role {body} --domain {domain}"
             ),
         }

@@ -1,4 +1,4 @@
-//! Which run a command means: one that is over or one that is under way, by one rule for every command.
+//! Finds the finished or running run that the command line names, by the same rules for every command.
 //!
 //! Must not follow a link of another user.
 
@@ -17,11 +17,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// The results of a run: its directory, or a recording. Without a name, and by the name `latest`, those of the newest run in `runs/`;
-/// the domain of a run that is under way stands for its directory.
+/// Returns the results of a run, a directory or a recording: of the newest run in `runs/` without a name or for `latest`. The
+/// domain of a running run selects its directory.
 ///
 /// # Errors
-/// Why there are none, and what to do.
+/// The reason why there are no results, with a remedy.
 pub fn results(given: Option<&Path>) -> Result<PathBuf, Failure> {
     match given.filter(|given| *given != Path::new(LATEST)) {
         None => newest(),
@@ -29,30 +29,30 @@ pub fn results(given: Option<&Path>) -> Result<PathBuf, Failure> {
     }
 }
 
-/// The directory that the results of a run go to, as its domain tells.
+/// Returns the results directory of a run, which its domain names.
 fn results_of(domain: &Domain) -> Option<PathBuf> {
     let path = files::read(&results_path(domain.root())).ok()?;
     Some(PathBuf::from(OsString::from_vec(path)))
 }
 
-/// The directory of the newest run.
+/// Returns the directory of the newest run.
 fn newest() -> Result<PathBuf, Failure> {
     let link = Path::new(RUNS).join(LATEST);
     match Directory::open(&link) {
-        // By its own name, which stays true when the link moves on.
+        // By its own name, because the link moves.
         Ok(_) => Ok(fs::read_link(&link).map_or(link, |run| Path::new(RUNS).join(run))),
         Err(error) if error.kind() == ErrorKind::NotFound => {
-            let text = "no run is named, and there is no runs/latest here; run a scenario, or name a run's directory";
+            let text = "there is no runs/latest here; run a scenario, or name a run's directory";
             Err(Failure::new("no-latest-run", text))
         }
         Err(error) => Err(Failure::new("cannot-read", format!("{}: {error}; name a run's directory", link.display()))),
     }
 }
 
-/// The recording of a run: the file that is named, or that of the run's directory.
+/// Returns the recording of a run: the named file, or the one in the run's directory.
 ///
 /// # Errors
-/// As [`results`]; and where the run was not recorded, which one was.
+/// Like [`results`]. If the run was not recorded, the error names the newest run that was.
 pub fn recording(given: Option<&Path>) -> Result<PathBuf, Failure> {
     let path = results(given)?;
     if !path.is_dir() {
@@ -62,38 +62,38 @@ pub fn recording(given: Option<&Path>) -> Result<PathBuf, Failure> {
     if file.exists() {
         return Ok(file);
     }
-    let other = match newest_recording(&path) {
-        Some(other) => format!("the newest run with one is {}", other.parent().unwrap_or(&other).display()),
-        None => format!("`{} run SCENARIO --record` keeps the samples of a run", name()),
+    let remedy = match newest_recording(&path) {
+        Some(file) => format!("the newest recorded run is {}", file.parent().unwrap_or(&file).display()),
+        None => format!("record a run with `{} run SCENARIO --record`", name()),
     };
-    Err(Failure::new("no-recording", format!("{} has no {RECORDING}; {other}", path.display())))
+    Err(Failure::new("no-recording", format!("{} has no {RECORDING}; {remedy}", path.display())))
 }
 
-/// The newest recording in `runs/` of another run than the one in this directory, or this file.
-pub fn newest_recording(than: &Path) -> Option<PathBuf> {
-    let than = fs::canonicalize(than).ok()?;
+/// Returns the newest recording in `runs/`, except that of the given directory or file.
+pub fn newest_recording(except: &Path) -> Option<PathBuf> {
+    let except = fs::canonicalize(except).ok()?;
     let entries = fs::read_dir(RUNS).ok()?.flatten().filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()));
     let recorded = entries.filter_map(|entry| {
         let file = entry.path().join(RECORDING);
         let modified = fs::metadata(&file).ok().filter(fs::Metadata::is_file)?.modified().ok()?;
         let (whole, directory) = (fs::canonicalize(&file).ok()?, fs::canonicalize(entry.path()).ok()?);
-        (whole != than && directory != than).then_some((modified, file))
+        (whole != except && directory != except).then_some((modified, file))
     });
     recorded.max().map(|(_, file)| file)
 }
 
-/// The domain of a run that is under way: the newest of this user without a name, and by the name `latest`; else the one of that
-/// domain, or whose results go to that directory, or that recording.
+/// Returns the domain of a running run, given by its domain, results directory or recording: of the user's newest run without
+/// a name or for `latest`.
 ///
 /// # Errors
-/// The exit code, once the reason is told.
+/// The exit code, once the reason is printed.
 pub fn domain(given: Option<&Path>) -> Result<PathBuf, Exit> {
     let given = given.filter(|given| *given != Path::new(LATEST));
     find_run(given).map_err(|error| fail(Exit::Usage, error))
 }
 
-/// Prepares a process to join a run: it dies with its parent, if one is given, and signals set a flag. Returns the run's domain and
-/// the flag.
+/// Prepares this process to join a run: it dies with its parent, if given, and signals set a flag. Returns the run's domain
+/// and the flag.
 ///
 /// # Errors
 /// The exit code, once the reason is printed.

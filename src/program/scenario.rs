@@ -1,6 +1,6 @@
-//! Which scenario a command means: one that ships with the program by its name, a file by its path, or standard input.
+//! Finds the scenario that the command line names: a shipped one by its name, a file by its path, or standard input.
 //!
-//! Must not judge what it reads: [`crate::config`] does.
+//! Must not validate: [`crate::config`] does.
 
 use super::output::Failure;
 use super::shipped::{campaigns, name, scenarios};
@@ -12,19 +12,19 @@ use std::fs::File;
 use std::io;
 use std::path::Path;
 
-/// Standard input, as a command line names it.
+/// Standard input on the command line.
 const STANDARD_INPUT: &str = "-";
-/// Standard input, as errors name it.
+/// Standard input in errors.
 const STDIN: &str = "stdin";
 
-/// The most of a line that is quoted, characters.
+/// Length limit of a quoted line, characters.
 const MAX_QUOTED: usize = 120;
 
-/// A change of a scenario that the command line asks for.
+/// A change of a scenario by the command line.
 pub enum Change<'a> {
     /// `--set KEY=VALUE`.
     Set(&'a str),
-    /// An option of its own, with its name, its key and its value as typed.
+    /// An option that sets a key: the option, the key and the value as typed.
     Option(&'static str, &'static str, &'a str),
 }
 
@@ -37,13 +37,13 @@ impl Change<'_> {
     }
 }
 
-/// The scenario that is meant, with changes; the program's first where none is named.
+/// Loads a scenario and applies changes. Without a name it is the program's first.
 pub fn load<'a>(given: Option<&Path>, changes: impl IntoIterator<Item = Change<'a>>) -> Result<Scenario, Failure> {
     let shipped = |name: &str| {
         let (_, text) = scenarios().iter().find(|(known, _)| *known == name).ok_or_else(|| unknown(name))?;
         Ok(Cow::Borrowed(*text))
     };
-    let none = "this program has no scenario of its own; name a scenario file";
+    let none = "this program has no shipped scenario; name a scenario file";
     let first = || first().ok_or_else(|| Failure::new("no-scenario", none));
     let (text, origin) = match given {
         Some(given) => text(given, &shipped)?,
@@ -59,7 +59,7 @@ pub fn load<'a>(given: Option<&Path>, changes: impl IntoIterator<Item = Change<'
     resolved.map_err(|error| quoting(error, &origin, &text))
 }
 
-/// The scenario of a document with changes.
+/// Applies changes to a document and resolves it to a scenario.
 pub fn changed<'a>(
     mut document: Document,
     changes: impl IntoIterator<Item = Change<'a>>,
@@ -68,7 +68,7 @@ pub fn changed<'a>(
     Scenario::resolve(document)
 }
 
-/// The text that is meant, by the name under which it is shipped, by its path or from standard input; and what errors call it.
+/// Reads a text: a shipped one by its name, a file by its path, or standard input. Returns it with its name in errors.
 pub fn text(given: &Path, shipped: Shipped<'_>) -> Result<(Cow<'static, str>, String), ConfigError> {
     let shipped = |name: &str| Ok((shipped(name)?, format!("{name}.toml")));
     let read = |text: Result<String, ConfigError>, origin: &Path| {
@@ -85,7 +85,7 @@ pub fn text(given: &Path, shipped: Shipped<'_>) -> Result<(Cow<'static, str>, St
     }
 }
 
-/// The mistakes, and below each that stands in the text its line there.
+/// Returns the problems, each followed by its line of the text.
 pub fn quoting(error: ConfigError, origin: &str, text: &str) -> Failure {
     let ConfigError::Invalid { problems } = error else { return error.into() };
     let quoted = |problem: Problem| {
@@ -100,7 +100,7 @@ pub fn quoting(error: ConfigError, origin: &str, text: &str) -> Failure {
     Failure(problems.into_iter().map(quoted).collect())
 }
 
-/// What is given, unless it is a file's path: a file of a shipped scenario's name must not change what that name means.
+/// Returns the name, or `None` for a path: a file must not hide a shipped scenario of the same name.
 fn name_in(given: &Path) -> Option<&str> {
     given.to_str().filter(|text| is_name(text))
 }
@@ -109,7 +109,7 @@ fn first() -> Option<&'static str> {
     scenarios().first().map(|(name, _)| *name)
 }
 
-/// What to call a scenario that could not be read.
+/// Returns a name for a scenario that could not be read.
 pub fn stem(given: Option<&Path>) -> String {
     match given {
         None => first().unwrap_or(name()).to_owned(),
@@ -118,7 +118,7 @@ pub fn stem(given: Option<&Path>) -> String {
     }
 }
 
-/// What to say of a name that no scenario has.
+/// Returns the error for a name that no scenario has.
 pub fn unknown(name: &str) -> ConfigError {
     if campaigns().iter().any(|(known, _)| *known == name) {
         let remedy = format!("run it with `corotate sweep {name}`, or one case of it with --case N");
@@ -127,12 +127,13 @@ pub fn unknown(name: &str) -> ConfigError {
     let known: Vec<&str> = scenarios().iter().map(|(name, _)| *name).collect();
     let remedy = nearest(name, &known);
     let end = if remedy.ends_with('?') { "" } else { "." };
-    let text =
-        format!("there is no scenario `{name}`; {remedy}{end} A file is given by its path, as ./{name} or {name}.toml");
+    let text = format!(
+        "there is no scenario `{name}`; {remedy}{end} Give a file by its path, such as ./{name} or {name}.toml"
+    );
     ConfigError::Unknown { code: "unknown-scenario", text }
 }
 
-/// What a scenario is, in a line: the first of its text, if that is a comment.
+/// Returns the title of a scenario: the first line of its text, if it is a comment.
 pub fn title(text: &str) -> &str {
     text.lines().next().and_then(|line| line.strip_prefix('#')).unwrap_or_default().trim()
 }
@@ -143,7 +144,7 @@ mod tests {
     use crate::config::Place;
 
     #[test]
-    fn the_line_that_an_error_is_about_is_quoted() {
+    fn errors_quote_their_line() {
         let text = "a = 1\nb = 2   \n";
         let quote =
             |place: Place| quoting(ConfigError::invalid(place, "b", "code", "wrong"), "x.toml", text).to_string();

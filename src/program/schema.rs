@@ -1,6 +1,6 @@
-//! `corotate schema`: what a scenario may say, for editors.
+//! `corotate schema`: prints the JSON Schema of scenarios.
 
-use super::output::{Ended, say};
+use super::output::{CommandResult, say};
 use super::shipped::{name, scenarios};
 
 /// Options of `corotate schema`.
@@ -9,16 +9,16 @@ use super::shipped::{name, scenarios};
 pub struct Arguments {}
 
 const EXAMPLES: &str = "\
-With it an editor completes keys, explains them and marks what is misspelt. What
-two keys say together, and which quantities [accept] and [watchdog] can name,
-only `corotate check` judges.
+Editors complete and explain keys with it, and mark misspelt ones. Only
+`corotate check` validates combinations of keys, and the quantities in [accept]
+and [watchdog].
 
 Example, for editors with Taplo (Even Better TOML, Helix, Neovim):
   corotate schema > scenario.schema.json
   echo '#:schema ./scenario.schema.json' | cat - pair.toml > with-schema.toml";
 
 /// Prints the schema.
-pub fn schema(_: &Arguments) -> Ended {
+pub fn schema(_: &Arguments) -> CommandResult {
     let schema = crate::scenario::schema(name(), scenarios());
     let text = serde_json::to_string_pretty(&schema).expect("plain values are JSON");
     say(&(text + "\n"))

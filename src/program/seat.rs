@@ -1,6 +1,6 @@
-//! `corotate seat`: what a foreign program must know to take a role's seat.
+//! `corotate seat`: prints what a foreign program needs to be a role.
 
-use super::output::{Ended, Exit, fail, say};
+use super::output::{CommandResult, Exit, fail, say};
 use super::runs;
 use super::scenario::{Change, load};
 use crate::config::{ClockKind, NotExternal};
@@ -18,13 +18,13 @@ pub struct Arguments {
     file: PathBuf,
     /// The role: a body's name, observer or controller
     role: String,
-    /// What drives the ticks
+    /// Clock of the ticks
     #[arg(long, value_name = "CLOCK", value_parser = ["realtime", "lockstep"])]
     clock: Option<String>,
     /// Override any key of the scenario
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// The run that waits for the role: its domain, the directory that its results go to, or latest; SCENARIO is then the domain's scenario.toml
+    /// The waiting run's domain or results directory, or latest; SCENARIO must be the domain's scenario.toml
     #[arg(long, value_name = "DIR")]
     domain: Option<PathBuf>,
 }
@@ -32,10 +32,10 @@ pub struct Arguments {
 const EXAMPLES: &str = "\
 Example:
   corotate seat pair.toml follower
-                                   services, samples and fields of that seat";
+                                   services, samples and fields of the role";
 
-/// Prints a seat.
-pub fn seat(arguments: &Arguments) -> Ended {
+/// Prints the seat as JSON.
+pub fn seat(arguments: &Arguments) -> CommandResult {
     let clock = arguments.clock.iter().map(|clock| Change::Option("--clock", "clock", clock));
     let changes = arguments.set.iter().map(|argument| Change::Set(argument)).chain(clock);
     let scenario = load(Some(&arguments.file), changes).map_err(|error| fail(Exit::Usage, error))?;
@@ -53,7 +53,7 @@ pub fn seat(arguments: &Arguments) -> Ended {
     if domain.is_none() {
         let name = &arguments.role;
         tell(format_args!(
-            "corotate: a domain exists while a run does; `run --external {name}` writes this with its domain, or give --domain"
+            "corotate: without a domain, which exists only during a run; `run --external {name}` writes it with one, or add --domain"
         ));
     }
     say(&describe_seat(&scenario, role, domain.as_ref()).to_json())

@@ -1,4 +1,4 @@
-//! What this program was made with and called with: the scenarios and campaigns that ship with it, its name, its words.
+//! Scenarios and campaigns that ship with the program, its name and its command line.
 
 use std::ffi::OsString;
 use std::path::Path;
@@ -6,26 +6,26 @@ use std::sync::OnceLock;
 
 pub static SCENARIOS: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
 
-/// The scenarios that ship with this program.
+/// Returns the shipped scenarios, as names and texts.
 pub fn scenarios() -> &'static [(&'static str, &'static str)] {
     SCENARIOS.get().map_or(&[], Vec::as_slice)
 }
 
 pub static CAMPAIGNS: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
 
-/// The campaigns that ship with this program.
+/// Returns the shipped campaigns, as names and texts.
 pub fn campaigns() -> &'static [(&'static str, &'static str)] {
     CAMPAIGNS.get().map_or(&[], Vec::as_slice)
 }
 
-/// What the program was called with.
+/// The words of the command line; the first is the program's name.
 pub static WORDS: OnceLock<Vec<OsString>> = OnceLock::new();
 
 pub fn words_given() -> &'static [OsString] {
     WORDS.get().map_or(&[], Vec::as_slice)
 }
 
-/// How this program is called.
+/// Returns the file name of the program.
 pub fn name() -> &'static str {
     static NAME: OnceLock<String> = OnceLock::new();
     NAME.get_or_init(|| {

@@ -1,4 +1,4 @@
-//! Signals that ask a process to end, and the parent whose death ends it.
+//! Termination by signals, and by the death of the parent.
 
 use super::output::{Exit, Failure, fail};
 use crate::system::remedy;
@@ -11,7 +11,7 @@ fn not_caught(error: io::Error) -> Failure {
     Failure::new("no-signals", format!("cannot catch signals: {error}; {}", remedy(&error)))
 }
 
-/// The number of the signal that asked for the end, once one has.
+/// Catches SIGINT, SIGTERM and SIGHUP. Returns the number of the last one; 0 before the first.
 pub fn catch_signals() -> Result<Arc<AtomicUsize>, Failure> {
     let signal = Arc::new(AtomicUsize::new(0));
     for number in [SIGINT, SIGTERM, SIGHUP] {
@@ -20,7 +20,7 @@ pub fn catch_signals() -> Result<Arc<AtomicUsize>, Failure> {
     Ok(signal)
 }
 
-/// A flag that the signals which ask a process to end set.
+/// Catches SIGINT and SIGTERM. Returns a flag that they set.
 pub fn terminated_by_signals() -> Result<Arc<AtomicBool>, Exit> {
     let terminated = Arc::new(AtomicBool::new(false));
     for signal in [SIGTERM, SIGINT] {
@@ -35,7 +35,7 @@ pub fn die_with(parent: i32) -> Result<(), Exit> {
     use rustix::process::{Signal, getppid, set_parent_process_death_signal};
     set_parent_process_death_signal(Some(Signal::KILL)).map_err(|error| {
         let error = io::Error::from(error);
-        let text = format!("cannot be bound to the launcher's life: {error}; {}", remedy(&error));
+        let text = format!("cannot request death with the launcher: {error}; {}", remedy(&error));
         fail(Exit::Failure, Failure::new("not-bound", text))
     })?;
     // The parent may have died before the request.

@@ -1,7 +1,7 @@
-//! `corotate sweep`: a campaign from file to table.
+//! `corotate sweep`: runs a campaign and writes its table.
 
 use super::campaign;
-use super::output::{Ended, Exit, Failure, fail, print, remark};
+use super::output::{CommandResult, Exit, Failure, fail, print, remark};
 use super::signals::catch_signals;
 use crate::campaign::{
     Axis, Campaign, Case, Counts, JournalError, Margin, Shard, Sweep, SweepError, Swept, Table, merge, worst,
@@ -29,22 +29,22 @@ pub struct Arguments {
     /// Override a key of the scenario, in every case
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Directory, new or to go on with [default: runs/<utc>-<name>]
+    /// Directory of the results, new or to be resumed [default: runs/<utc>-<name>]
     #[arg(long, value_name = "DIR", conflicts_with = "resume")]
     out: Option<PathBuf>,
-    /// Go on with the newest results of this campaign in runs/
+    /// Resume the newest results of this campaign in runs/
     #[arg(long)]
     resume: bool,
-    /// How many cases run at a time [default: one per core]
+    /// Run N cases at a time [default: one per core]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=4096))]
     threads: Option<u16>,
-    /// Run every N-th case alone, from the I-th, from 0
+    /// Run only every N-th case, beginning with case I
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
-    /// What drives the ticks: lockstep is for few cases
+    /// Clock of the ticks; lockstep is slow, for few cases
     #[arg(long, value_name = "CLOCK", value_parser = ["in-process", "lockstep"], default_value = "in-process", hide_short_help = true)]
     clock: String,
-    /// Run the N worst once more, with every sample recorded
+    /// Run the N worst cases again and record every sample
     #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true)]
     record: usize,
     /// Print the summary as JSON, all else on stderr
@@ -57,17 +57,17 @@ pub struct Arguments {
 
 #[derive(clap::Subcommand)]
 enum Merge {
-    /// Put the results of all shards of a campaign together
+    /// Merge the results of all shards of a campaign
     Merge(MergeArguments),
 }
 
 /// Options of `corotate sweep merge`.
 #[derive(clap::Args)]
 struct MergeArguments {
-    /// The directories of the shards
+    /// Directories of the shards
     #[arg(required = true, value_name = "DIR")]
     directories: Vec<PathBuf>,
-    /// Directory for the whole
+    /// Directory of the merged results
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Print the summary as JSON
@@ -79,49 +79,49 @@ struct MergeArguments {
 }
 
 const EXAMPLES: &str = "\
-What is interrupted, by Ctrl-C or by kill -9, goes on where it was when the
-command is given again with the same --out, and ends with the same table.
+An interrupted campaign (Ctrl-C, kill -9) resumes if the command is repeated with
+the same --out. The table is the same.
 
 Examples:
-  corotate sweep timing-map        a campaign that ships with the program; a
-                                   table in runs/<utc>-timing-map/
+  corotate sweep timing-map        a shipped campaign; the table is in
+                                   runs/<utc>-timing-map/
   corotate sweep map.toml --out map --threads 2
-                                   your own, two cases at a time
-  corotate run map.toml --case 17  one of its cases, as any run
+                                   a file, two cases at a time
+  corotate run map.toml --case 17  a single case, as a run
   corotate sweep map.toml --out map --record 3
-                                   the three worst with every sample
+                                   also record the three worst cases
   corotate sweep map.toml --shard 0/4 --out part-0
-                                   the first of four machines
+                                   on the first of four machines
   corotate sweep merge part-0 part-1 part-2 part-3 --out map";
 
-/// How results are told.
+/// Options of the output.
 #[derive(Clone, Copy)]
-struct Telling {
+struct OutputOptions {
     json: bool,
     quiet: bool,
 }
 
-/// Runs a campaign, or puts the parts of one together.
-pub fn sweep(arguments: &Arguments) -> Ended {
+/// Runs a campaign or merges its shards.
+pub fn sweep(arguments: &Arguments) -> CommandResult {
     match (&arguments.merge, &arguments.file) {
-        (Some(Merge::Merge(given)), _) => put_together(given),
+        (Some(Merge::Merge(given)), _) => merge_shards(given),
         (None, Some(file)) => run(arguments, file),
         (None, None) => Err(fail(Exit::Usage, Failure::new("no-campaign", "name a campaign"))),
     }
 }
 
-fn put_together(given: &MergeArguments) -> Ended {
-    let telling = Telling { json: given.json, quiet: given.quiet };
+fn merge_shards(given: &MergeArguments) -> CommandResult {
+    let output = OutputOptions { json: given.json, quiet: given.quiet };
     let swept = merge(&given.directories, &given.out).map_err(|error| fail(exit_of(&error), error))?;
-    let head = format!("{} directories put together", given.directories.len());
-    tell(telling, &given.out, &head, &swept.counts.unwrap_or_default()).map(|()| Exit::Ok)
+    let head = format!("merged {} directories", given.directories.len());
+    print_results(output, &given.out, &head, &swept.counts.unwrap_or_default()).map(|()| Exit::Ok)
 }
 
 fn run(arguments: &Arguments, file: &Path) -> Result<Exit, Exit> {
     let campaign = campaign::load(file, &arguments.set).map_err(|error| fail(Exit::Usage, error))?;
     let directory = directory(arguments, &campaign)?;
     if cfg!(debug_assertions) && !arguments.quiet {
-        remark(&"this is a debug build, about 50 times as slow as a release build: `cargo build --release`");
+        remark(&"slow: this is a debug build, about 50 times slower than `cargo build --release`");
     }
     let signal = catch_signals().map_err(|error| fail(Exit::Failure, error))?;
     let threads = arguments.threads.map(usize::from);
@@ -152,13 +152,13 @@ fn run(arguments: &Arguments, file: &Path) -> Result<Exit, Exit> {
         return Ok(interrupted(arguments, &campaign, &directory, &swept, &signal));
     };
     let done = swept.done - before.unwrap_or(0);
-    let telling = Telling { json: arguments.json, quiet: arguments.quiet };
-    tell(telling, &directory, &head(&campaign, &swept, counts, done, began.elapsed(), threads), counts)?;
+    let output = OutputOptions { json: arguments.json, quiet: arguments.quiet };
+    print_results(output, &directory, &head(&campaign, &swept, counts, done, began.elapsed(), threads), counts)?;
     record_worst(arguments, &campaign, &directory, &signal)?;
     Ok(Exit::Ok)
 }
 
-/// Where the results go.
+/// Returns the directory of the results.
 fn directory(arguments: &Arguments, campaign: &Campaign) -> Result<PathBuf, Exit> {
     if let Some(out) = &arguments.out {
         return Ok(out.clone());
@@ -167,7 +167,7 @@ fn directory(arguments: &Arguments, campaign: &Campaign) -> Result<PathBuf, Exit
         let found = newest(campaign);
         return found.ok_or_else(|| {
             let name = campaign.name();
-            let text = format!("--resume: {RUNS}/ has no results of this campaign `{name}`; begin without it");
+            let text = format!("--resume: {RUNS}/ has no results of the campaign `{name}`; leave out --resume");
             fail(Exit::Usage, Failure::new("nothing-to-resume", text))
         });
     }
@@ -177,7 +177,7 @@ fn directory(arguments: &Arguments, campaign: &Campaign) -> Result<PathBuf, Exit
     })
 }
 
-/// The newest results of a campaign; their names begin with the time.
+/// Returns the newest results of a campaign; directory names begin with the time.
 fn newest(campaign: &Campaign) -> Option<PathBuf> {
     let entries = fs::read_dir(RUNS).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
     let mut found: Vec<PathBuf> = entries.filter(|path| campaign.began(path)).collect();
@@ -185,7 +185,7 @@ fn newest(campaign: &Campaign) -> Option<PathBuf> {
     found.pop()
 }
 
-/// The noun for a campaign's pieces of work.
+/// Returns the noun for a campaign's pieces of work.
 fn pieces(campaign: &Campaign) -> &'static str {
     if campaign.table().margins.is_empty() { "cases" } else { "cases and margin points" }
 }
@@ -210,8 +210,8 @@ fn interrupted(
     let number = signal.load(std::sync::atomic::Ordering::Relaxed);
     let file = arguments.file.as_deref().unwrap_or(Path::new(campaign.name())).display();
     let words = format!(
-        "ended in order by signal {number}: {} of {} {} are done; go on with `corotate sweep {file} --out {}` \
-         and the other options as they were",
+        "interrupted by signal {number}: {} of {} {} are done; resume with `corotate sweep {file} --out {}` \
+         and the same other options",
         swept.done,
         swept.all,
         pieces(campaign),
@@ -220,45 +220,45 @@ fn interrupted(
     fail(Exit::Signal(number), Failure::new("interrupted", words))
 }
 
-/// The first line: what was done, and how fast.
+/// Returns the first line: number of cases, duration and rate.
 fn head(campaign: &Campaign, swept: &Swept, counts: &Counts, done: u64, took: Duration, threads: usize) -> String {
-    let counted = |count: u64, one: &str| if count == 1 { format!("1 {one}") } else { format!("{count} {one}s") };
+    let counted = |count: u64, noun: &str| if count == 1 { format!("1 {noun}") } else { format!("{count} {noun}s") };
     let mut all = counted(counts.rows, "case");
     if counts.margin_points > 0 {
         all += &format!(" and {}", counted(counts.margin_points, "margin point"));
     }
     let threads = counted(threads as u64, "thread");
     match done {
-        0 => format!("{}: {all}, all of them done before", campaign.name()),
+        0 => format!("{}: {all}, all done before", campaign.name()),
         _ => {
             let (seconds, before) = (took.as_secs_f64(), swept.done - done);
-            let before = if before > 0 { format!(", {before} of them done before") } else { String::new() };
+            let before = if before > 0 { format!(", {before} done before") } else { String::new() };
             let rate = done as f64 / seconds;
             format!("{}: {all}{before}; {seconds:.2} s, {rate:.1} per second, {threads}", campaign.name())
         }
     }
 }
 
-/// Prints what there is.
-fn tell(telling: Telling, directory: &Path, head: &str, counts: &Counts) -> Result<(), Exit> {
+/// Prints counts and margins as text, the summary as JSON.
+fn print_results(output: OutputOptions, directory: &Path, head: &str, counts: &Counts) -> Result<(), Exit> {
     let failed = |failure| fail(Exit::Failure, failure);
     let path = directory.join("summary.json");
     let summary: serde_json::Value = fs::read(&path)
         .map_err(|error| error.to_string())
         .and_then(|bytes| serde_json::from_slice(&bytes).map_err(|error| error.to_string()))
         .map_err(|error| failed(Failure::new("unreadable-summary", format!("{}: {error}", path.display()))))?;
-    if !telling.quiet {
+    if !output.quiet {
         let axes: Vec<Axis> = serde_json::from_value(summary["axes"].clone()).unwrap_or_default();
         let margins: Vec<Margin> = serde_json::from_value(summary["margins"].clone()).unwrap_or_default();
         let margins = margin_words(&axes, &margins);
         let text = format!("{head}\n{}\n{margins}results in {}\n", words(counts), directory.display());
-        if telling.json {
+        if output.json {
             text.lines().for_each(crate::system::tell);
         } else {
             print(&text).map_err(failed)?;
         }
     }
-    if telling.json {
+    if output.json {
         let mut summary = summary;
         summary["directory"] = directory.display().to_string().into();
         print(&format!("{summary}\n")).map_err(failed)?;
@@ -277,7 +277,7 @@ fn words(counts: &Counts) -> String {
     verdicts.into_iter().zip(otherwise).map(verdict).collect::<Vec<_>>().join(", ")
 }
 
-/// The margins as a table: one row per point, by what is varied, as many as fit a screen.
+/// Returns a table of the margins, one row per point, at most a screen.
 fn margin_words(axes: &[Axis], margins: &[Margin]) -> String {
     const SHOWN: usize = 20;
     let mut text = String::new();
@@ -295,7 +295,7 @@ fn margin_words(axes: &[Axis], margins: &[Margin]) -> String {
     text
 }
 
-/// Runs the worst cases once more, with every sample recorded.
+/// Runs the worst cases again and records every sample.
 fn record_worst(
     arguments: &Arguments,
     campaign: &Campaign,
@@ -315,7 +315,7 @@ fn record_worst(
             return Err(Exit::Signal(number));
         }
         if !arguments.quiet {
-            remark(&format!("case {} is recorded in {}", case.number, path.display()));
+            remark(&format!("case {} recorded in {}", case.number, path.display()));
         }
     }
     Ok(())
@@ -325,7 +325,7 @@ fn record(campaign: &Campaign, case: &Case, path: &Path, signal: &AtomicUsize) -
     let mut scenario = campaign.scenario(case)?;
     let run = new_run().map_err(|error| Failure::new("no-random-numbers", format!("no random numbers: {error}")))?;
     (scenario.run, scenario.record) = (Some(run), true);
-    // The samples of a case are the same whenever it runs.
+    // Overwrites: a case has the same samples in every run.
     let claim = claim(path, run, true)?;
     if let Some(names) = claim.removed_names() {
         remark(&format!("removed from {}: {names}", path.display()));

@@ -1,6 +1,6 @@
-//! `corotate watch`: a screen on a running loop.
+//! `corotate watch`: shows a running loop on the terminal.
 
-use super::output::{Ended, Exit, fail, say};
+use super::output::{CommandResult, Exit, fail, say};
 use super::runs;
 use super::signals::catch_signals;
 use crate::sample::RoleState;
@@ -13,13 +13,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The run: the directory that its results go to, or its domain [default: the newest run of this user]
+    /// The run's results directory or domain [default: your newest run]
     #[arg(value_name = "DIR")]
     domain: Option<PathBuf>,
-    /// Watch for so long, s [default: 2], print one screen of 80 by 24, leave
+    /// Watch for S seconds (2 if left out), print one screen of 80 by 24, exit
     #[arg(long, value_name = "S", num_args = 0..=1, default_missing_value = "2", value_parser = seconds)]
     once: Option<f64>,
-    /// Print what the screen shows as one JSON object (corotate/watch/v1), with --once
+    /// With --once: print the screen as one JSON object (corotate/watch/v1)
     #[arg(long, requires = "once")]
     json: bool,
 }
@@ -33,47 +33,46 @@ fn seconds(text: &str) -> Result<f64, String> {
 }
 
 const EXAMPLES: &str = "\
-Keys: q quits, space lets the screen stand still, up, down and tab select a
-signal, left and right scroll its fields. Times are those of the samples' own
-stamps: due-sent from when a tick was due until the role's sample was sent,
-in-sent from when the sample that it waits for was sent; median/99 % of the last
-4096.
+Keys: q: quit; space: pause; up, down, tab: select a signal; left, right: scroll
+its fields. Latencies are median/99 % of the last 4096 samples, from the samples'
+stamps: due-sent from the tick's due time to the sending of the role's sample,
+in-sent from the sending of the input to that of the role's sample.
 
 Examples:
-  corotate run & corotate watch    the newest run of this user
-  corotate watch runs/pair         the run that `run --out runs/pair` began
+  corotate run & corotate watch    your newest run
+  corotate watch runs/pair         the run started by `run --out runs/pair`
   corotate watch --once 5 > screen.txt
                                    one screen as text, after five seconds";
 
-/// Watches until it is enough.
-pub fn watch(arguments: &Arguments) -> Ended {
+/// Watches until the user quits or `--once` has elapsed.
+pub fn watch(arguments: &Arguments) -> CommandResult {
     let signal = catch_signals().map_err(|error| fail(Exit::Failure, error))?;
     let domain = runs::domain(arguments.domain.as_deref())?;
     attempt(arguments, &domain, &signal).map_err(|error| fail(exit_of(&error), error))
 }
 
 fn attempt(arguments: &Arguments, domain: &Path, signal: &AtomicUsize) -> Result<Exit, WatchError> {
-    let told = || signal.load(Ordering::Relaxed);
-    let mut session = match Session::open(Some(domain), || told() != 0) {
-        Err(_) if told() != 0 => return Ok(Exit::Signal(told())),
+    let received = || signal.load(Ordering::Relaxed);
+    let mut session = match Session::open(Some(domain), || received() != 0) {
+        Err(_) if received() != 0 => return Ok(Exit::Signal(received())),
         opened => opened?,
     };
     match arguments.once {
         None => show(&mut session, signal)?,
         Some(seconds) => {
-            session.follow((seconds * 1e9) as u64, || told() != 0)?;
+            session.follow((seconds * 1e9) as u64, || received() != 0)?;
             if let Err(exit) = say(&if arguments.json { json(&session.model) } else { text(&session.model, 80, 24) }) {
                 return Ok(exit);
             }
         }
     }
-    Ok(match told() {
+    Ok(match received() {
         0 => Exit::Ok,
         number => Exit::Signal(number),
     })
 }
 
-/// What the screen shows, for programs. A number that is not finite is null.
+/// Returns the contents of the screen as JSON. A number that is not finite is null.
 fn json(model: &Model) -> String {
     let role = |role: &RoleLine| {
         let state = RoleState::NAMES.into_iter().find(|(_, state)| *state == role.state).map(|(name, _)| name);

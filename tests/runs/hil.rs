@@ -619,7 +619,7 @@ fn the_foreign_follower_refuses_seats_without_a_domain_and_of_other_roles() {
     let bench = Bench::new();
     for (role, reason) in [("follower", "domain"), ("leader", "driven body"), ("observer", "driven body")] {
         let printed = bench.run(&["seat", file("pair.toml").to_str().unwrap(), role]);
-        assert!(printed.stderr.contains("domain"), "{printed:?}");
+        assert!(printed.stderr.contains("--domain"), "{printed:?}");
         std::fs::write(bench.path("seat.json"), printed.stdout).unwrap();
         let refused = start_follower(&bench, &bench.path("seat.json"), &[]).wait();
         assert_eq!(refused.code, Some(2), "{refused:?}");

@@ -255,8 +255,8 @@ fn a_run_that_is_stopped_is_not_judged() {
     let done = run.wait();
     // Ticks that were missed by then are named, too.
     let last = done.stdout.lines().last().unwrap_or_default();
-    assert!(done.code == Some(130) && last.starts_with("NOT JUDGED: ended in order by signal 2"), "{done:?}");
-    for words in ["results go to runs/", "the run's domain is ", "ticks 0 to 12000 run"] {
+    assert!(done.code == Some(130) && last.starts_with("NOT JUDGED: stopped by signal 2"), "{done:?}");
+    for words in ["results go to runs/", "the run's domain is ", "running ticks 0 to 12000"] {
         assert!(done.stderr.contains(words), "{words}: {done:?}");
     }
     assert!(done.stderr.contains(domain.to_str().unwrap()), "{done:?}");

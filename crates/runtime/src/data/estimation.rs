@@ -106,7 +106,7 @@ pub struct Estimated {
     /// The angular velocity about the principal axes, rad/s; NaN where it was not measured.
     pub principal_rad_s: Vector3<f64>,
     /// The reconstructed hidden component.
-    pub told: Reconstructed,
+    pub estimate: Reconstructed,
 }
 
 /// The result for a log.
@@ -184,7 +184,7 @@ pub fn estimate_log(
         let principal_rad_s = principal(entry);
         let reconstructed = reconstruction.push(&Sample { time_s: entry.time_s, rate_rad_s: principal_rad_s });
         score.push(reconstructed.rate_rad_s, principal_rad_s[hidden], reconstructed.observed);
-        each(&Estimated { entry: *entry, principal_rad_s, told: reconstructed }, &name).map_err(EstimateError::Sink)
+        each(&Estimated { entry: *entry, principal_rad_s, estimate: reconstructed }, &name).map_err(EstimateError::Sink)
     };
     let mut names = String::new();
     for (entry, named) in &head {
