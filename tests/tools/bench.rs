@@ -1,5 +1,5 @@
-//! The benchmark does what it says: every row, every floor, files that other tools read, and nothing left behind.
-//! No figure is judged here: a smoke run on a loaded machine measures nothing.
+//! `corotate bench`: every row with its floors, result files that other tools read, and no files left behind.
+//! Figures are not checked: a smoke run on a loaded machine measures nothing.
 
 use crate::common::{Bench, Done, Running, await_some};
 use corotate::bench::ROWS;
@@ -8,7 +8,7 @@ use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Runs a command to its end, and finds out which domains it used.
+/// Runs a command to its end and returns the domains that it used.
 fn run_listing_domains(bench: &Bench, arguments: &[&str]) -> (Done, Vec<PathBuf>) {
     let running = bench.start(arguments);
     let pid = running.pid();
@@ -26,17 +26,20 @@ fn measure(bench: &Bench, rows: &[&str]) -> Value {
         run_listing_domains(bench, &[&["bench", "--quick", "--json", "--out", "results"], rows].concat());
     assert_eq!(done.code, Some(0), "{done:?}");
     bench.assert_clean(&domains);
-    assert!(done.stderr.contains("a smoke run") && done.stderr.contains("granted: "), "{}", done.stderr);
-    assert_eq!(done.stderr.contains("a debug build"), cfg!(debug_assertions), "{}", done.stderr);
-    assert!(!done.stderr.contains("NOT MET"), "{}", done.stderr);
     let printed = done.json();
+    let reasons = printed["not_judged"].as_array().unwrap();
+    assert_eq!(reasons.len(), if cfg!(debug_assertions) { 2 } else { 1 }, "smoke run, debug build: {printed}");
+    let privileges = printed["privileges"].as_array().unwrap().iter().map(|grant| &grant["privilege"]);
+    for text in reasons.iter().chain(privileges) {
+        assert!(done.stderr.contains(text.as_str().unwrap()), "{text}: {}", done.stderr);
+    }
     let written = std::fs::read_to_string(bench.path("results/bench.json")).unwrap();
     assert_eq!(printed, serde_json::from_str::<Value>(&written).unwrap());
     assert!(done.stderr.contains(&std::fs::read_to_string(bench.path("results/bench.txt")).unwrap()));
     printed
 }
 
-/// The rows that were asked for, each with figures, floors and every one of its targets.
+/// Asserts that the results have exactly these rows, with figures, floors and all targets.
 fn assert_rows(bench: &Bench, results: &Value, rows: &[&str]) {
     assert_eq!((results["schema"].as_str(), results["quick"].as_bool()), (Some("corotate/bench/v1"), Some(true)));
     assert!(results["host"]["cores"].as_u64().unwrap() > 0 && !results["privileges"].as_array().unwrap().is_empty());
@@ -57,11 +60,11 @@ fn assert_rows(bench: &Bench, results: &Value, rows: &[&str]) {
     let expected: usize = ROWS.iter().filter(|row| rows.contains(&row.name)).map(|row| row.targets.len()).sum();
     assert_eq!(results["targets"].as_array().unwrap().len(), expected);
     for target in results["targets"].as_array().unwrap() {
-        assert!(target["met"].is_null(), "a smoke run judges nothing: {target}");
+        assert!(target["met"].is_null(), "a smoke run judges no target: {target}");
     }
 }
 
-/// The histogram of a figure is a file with all of its values.
+/// Asserts that the figure's histogram file has all of its values.
 fn assert_histogram(bench: &Bench, figure: &Value) {
     let name = figure["name"].as_str().unwrap().replace(|letter: char| !letter.is_ascii_alphanumeric(), "-");
     let path = bench.path(&format!("results/latency/{}.{name}.hgrm", figure["row"].as_str().unwrap()));
@@ -83,7 +86,7 @@ fn has(results: &Value, row: &str, name: &str) -> bool {
 }
 
 #[test]
-fn the_hop_stands_beside_all_its_floors() {
+fn the_hop_row_measures_every_floor() {
     let bench = Bench::new();
     let results = measure(&bench, &["hop"]);
     assert_rows(&bench, &results, &["hop"]);
@@ -100,7 +103,7 @@ fn the_hop_stands_beside_all_its_floors() {
 }
 
 #[test]
-fn whole_runs_stand_beside_theirs() {
+fn rows_of_whole_runs_measure_their_floors() {
     let bench = Bench::new();
     let rows = ["chain", "tick", "lockstep", "run", "overhead", "processor"];
     let results = measure(&bench, &rows);
@@ -132,7 +135,7 @@ fn whole_runs_stand_beside_theirs() {
 }
 
 #[test]
-fn ctrl_c_ends_it_and_leaves_nothing() {
+fn ctrl_c_ends_the_benchmark_and_leaves_no_files() {
     let bench = Bench::new();
     let running: Running = bench.start(&["bench", "hop", "--out", "results"]);
     await_some(|| (bench.processes().len() > 2).then_some(()));
@@ -145,25 +148,25 @@ fn ctrl_c_ends_it_and_leaves_nothing() {
 }
 
 #[test]
-fn a_row_that_is_none_is_refused_with_those_that_are() {
+fn an_unknown_row_is_refused_with_a_list_of_the_rows() {
     let done = Bench::new().run(&["bench", "hops"]);
-    assert_eq!(done.code, Some(2), "{done:?}");
+    assert!(done.code == Some(2) && done.says("unknown-row"), "{done:?}");
     for row in ROWS {
         assert!(done.stderr.contains(row.name), "{}", done.stderr);
     }
 }
 
 #[test]
-fn what_judges_nothing_is_not_checked() {
+fn check_needs_a_full_run_of_a_release_build() {
     let bench = Bench::new();
-    let mut ways = vec![(vec!["bench", "hop", "--check", "--quick"], "a smoke run")];
+    let mut unjudged = vec![(vec!["bench", "hop", "--check", "--quick"], false)];
     if cfg!(debug_assertions) {
-        ways.push((vec!["bench", "hop", "--check"], "a debug build"));
+        unjudged.push((vec!["bench", "hop", "--check"], true));
     }
-    for (arguments, reason) in ways {
+    for (arguments, debug_build) in unjudged {
         let done = bench.run(&arguments);
-        assert_eq!(done.code, Some(2), "{done:?}");
-        assert!(done.stderr.contains(reason), "{done:?}");
+        assert!(done.code == Some(2) && done.says("nothing-to-judge"), "{done:?}");
+        assert_eq!(done.stderr.contains("--release"), debug_build, "{done:?}");
         assert!(!bench.path("runs").exists());
     }
 }

@@ -1,11 +1,11 @@
-//! The page of a campaign that was run: whole, well-formed, alone on the network, true to the table; and what it refuses.
+//! The page of a campaign: complete, well-formed, without references to other files, equal to the table; and refused options.
 
 use crate::common::{Bench, Done};
 use corotate::campaign::{End, Table};
 use roxmltree::{Document, Node, ParsingOptions};
 use std::fs;
 
-/// Gains and rates of the loop on both sides of what is accepted and of what is valid; short, so that a debug build is quick.
+/// Gains and tick rates on both sides of the borders of acceptance and validity; short, so that a debug build is quick.
 const MAP: &str = r#"
 name = "map"
 base = "rigid-pair"
@@ -70,9 +70,9 @@ fn rows(section: Node<'_, '_>) -> Vec<Vec<String>> {
 }
 
 #[test]
-fn a_campaign_that_was_run_is_shown_as_its_table_has_it() {
+fn the_page_of_a_campaign_agrees_with_its_table() {
     let bench = bench();
-    let told = well(bench.run(&["sweep", "./map.toml", "--out", "results"])).stdout;
+    let printed = well(bench.run(&["sweep", "./map.toml", "--out", "results"])).stdout;
     let html = page(&bench, &["--figures", "figures"]);
     let (page, table) = (parse(&html), Table::read(&bench.path("results")).unwrap());
     let sections: Vec<&str> = page
@@ -91,36 +91,37 @@ fn a_campaign_that_was_run_is_shown_as_its_table_has_it() {
         map.descendants().filter(|node| node.has_tag_name("title")).filter_map(|node| node.text()).collect();
     assert_eq!(titles.len(), 18);
     for row in &table.rows {
-        let said = titles.iter().find(|title| title.ends_with(&format!("; case {}", row.case))).unwrap();
+        let title = titles.iter().find(|title| title.ends_with(&format!("; case {}", row.case))).unwrap();
         let verdict = match row.accepted {
             Some(true) => "; accepted; ",
             Some(false) => "; not accepted; ",
             None => ": no value; not judged; ",
         };
-        assert!(said.contains(verdict), "{said}: {row:?}");
-        assert_eq!(said.contains("; a rate is claimed"), row.predicted_rate_per_s.is_some_and(|rate| rate > 0.0));
+        assert!(title.contains(verdict), "{title}: {row:?}");
+        assert_eq!(title.contains("; a rate is claimed"), row.predicted_rate_per_s.is_some_and(|rate| rate > 0.0));
     }
     assert!(map.descendants().any(|node| node.attribute("data-label") == Some("border of acceptance")));
-    // Of slow loops the largest gains are refused, and that is said once for each reason.
+    // In slow loops the largest gains are invalid; the page lists each reason once.
     let invalid = table.rows.iter().filter(|row| row.exit == End::Invalid).count();
     let refused =
         rows(section(&page, "reasons"))[1..].iter().map(|row| row[0].parse::<usize>().unwrap()).sum::<usize>();
     assert!(invalid > 0 && refused == invalid, "{refused} {invalid}");
-    // Every case is counted once, under its verdict; how it ended is told of those.
+    // The printed counts: each case once under its verdict, and in brackets how invalid ones ended.
     let (mut cases, mut ended, mut nested) = (0, 0, false);
-    for word in told.lines().nth(1).unwrap().split([' ', ',']) {
+    for word in printed.lines().nth(1).unwrap().split([' ', ',']) {
         nested |= word.starts_with('(');
         let count = word.trim_matches(['(', ')']).parse::<usize>().unwrap_or(0);
         *(if nested { &mut ended } else { &mut cases }) += count;
         nested &= !word.ends_with(')');
     }
-    assert_eq!((cases, ended), (18, invalid), "{told}");
-    assert!(told.starts_with("map: 18 cases and 3 margin points; "), "{told}");
+    assert_eq!((cases, ended), (18, invalid), "{printed}");
+    let head: Vec<&str> = printed.lines().next().unwrap().split_whitespace().collect();
+    assert!(head.contains(&"18") && head.contains(&"3"), "cases and margin points: {printed}");
     assert!(html.contains("bar across the scale marks the limit, 0.02"));
     let margins = rows(section(&page, "margins"));
     assert_eq!(margins.len(), 1 + table.margins[0].points.len());
     assert_eq!(margins[0], ["tick_hz", "holds at", "fails at", "runs"]);
-    // What a row of the worst cases says is run as it stands, and comes to the same.
+    // The command in a row of the worst cases reproduces the case.
     let worst = rows(section(&page, "worst"));
     let command: Vec<&str> = worst[1][1].split(' ').collect();
     assert_eq!(command[..2], ["corotate", "run"]);
@@ -137,19 +138,19 @@ fn a_campaign_that_was_run_is_shown_as_its_table_has_it() {
 }
 
 #[test]
-fn what_has_been_run_is_shown_and_what_a_campaign_has_not_is_refused() {
+fn an_unfinished_campaign_is_shown_and_options_of_runs_are_refused() {
     let bench = bench();
     well(bench.run(&["sweep", "./map.toml", "--out", "results", "--shard", "0/3", "-q"]));
     let html = page(&bench, &[]);
     assert!(html.contains("12 of 18 cases are missing"), "{html}");
     assert!(text(section(&parse(&html), "result")).contains("cases run6"));
-    // Half a line at the end is none.
+    // Half a line at the end is ignored.
     let journal = bench.path("results/journal");
     let whole = fs::read(&journal).unwrap();
     fs::write(&journal, &whole[..whole.len() - 40]).unwrap();
     assert!(page(&bench, &[]).contains("cases are missing"));
-    for other in [&["--show", "leader/truth.omega_rad_s"][..], &["results"]] {
-        let done = bench.run(&[&["report", "results"], other].concat());
+    for options in [&["--show", "leader/truth.omega_rad_s"][..], &["results"]] {
+        let done = bench.run(&[&["report", "results"], options].concat());
         assert_eq!(done.code, Some(2), "{done:?}");
         assert!(done.says("campaign-alone"), "{done:?}");
     }

@@ -1,19 +1,24 @@
-//! `corotate doctor` as a user runs it: on this machine, whatever that is.
+//! `corotate doctor` on the machine that runs the tests.
 
 use crate::common::{self, Bench, await_some};
 use libc::{SIGKILL, SIGSTOP, SIGTERM};
 use serde_json::Value;
 
 fn checks(report: &Value) -> Vec<(&str, &str)> {
-    let text = |check: &'static str, of: &Value| of[check].as_str().unwrap().to_owned();
     let checks = report["checks"].as_array().unwrap();
-    checks.iter().for_each(|check| assert!(!text("found", check).is_empty(), "{check}"));
+    assert!(checks.iter().all(|check| !check["found"].as_str().unwrap().is_empty()), "{report}");
     checks.iter().map(|check| (check["name"].as_str().unwrap(), check["verdict"].as_str().unwrap())).collect()
 }
 
-/// The exit code is the verdict, and the verdict that of the lines.
+/// Runs `doctor --json` without a trial, and returns its check of leftover domains.
+fn leftover_domains(bench: &Bench, options: &[&str]) -> Value {
+    let report = bench.run(&[&["doctor", "--seconds", "0", "--json"], options].concat()).json();
+    report["checks"].as_array().unwrap().iter().find(|check| check["name"] == "leftover domains").unwrap().clone()
+}
+
+/// The exit code is the worst verdict of the lines.
 #[test]
-fn every_line_has_a_verdict_and_the_exit_code_is_theirs() {
+fn the_exit_code_is_the_worst_verdict() {
     let bench = Bench::new();
     let done = bench.run(&["doctor", "--seconds", "1", "--json"]);
     let report = done.json();
@@ -50,9 +55,9 @@ fn every_line_has_a_verdict_and_the_exit_code_is_theirs() {
     bench.assert_clean(&[]);
 }
 
-/// Nothing is called fit that was not measured, and what cannot keep its rate is not fit.
+/// Without a trial the machine is never called fit; a machine that misses ticks is unfit.
 #[test]
-fn fit_has_a_number_behind_it() {
+fn only_a_measured_machine_is_fit() {
     let bench = Bench::new();
     let done = bench.run(&["doctor", "--seconds", "0", "--json"]);
     let report = done.json();
@@ -72,16 +77,16 @@ fn fit_has_a_number_behind_it() {
 }
 
 #[test]
-fn an_ordinary_user_is_told_too() {
+fn an_unprivileged_user_gets_a_report() {
     let bench = Bench::unprivileged();
     let done = bench.run(&["doctor", "--seconds", "0", "--json"]);
     let report = done.json();
     assert!(checks(&report).len() > 10 && matches!(done.code, Some(0 | 3)), "{done:?}");
 }
 
-/// A whole run that was killed, janitor and all, stays until somebody cleans up; a running one is left alone.
+/// The files of a run whose processes were all killed, janitor included, stay until `--clean`; a running one is left alone.
 #[test]
-fn what_a_killed_run_left_is_told_and_removed_on_demand() {
+fn clean_removes_the_files_of_killed_runs_only() {
     let bench = Bench::new();
     let domain =
         |bench: &Bench| await_some(|| bench.domains().pop().filter(|path| path.join("scenario.toml").exists()));
@@ -89,30 +94,33 @@ fn what_a_killed_run_left_is_told_and_removed_on_demand() {
     let dead = domain(&bench);
     bench.await_role("controller");
     let processes = bench.processes();
-    // All are stopped before the first is killed, so that nobody cleans up after another.
+    // All are stopped before the first is killed, so that none cleans up after another.
     for signal in [SIGSTOP, SIGKILL] {
         processes.iter().for_each(|pid| common::send_signal(*pid, signal));
     }
     drop(killed);
     await_some(|| bench.processes().is_empty().then_some(()));
-    let told = bench.run(&["doctor", "--seconds", "0"]);
-    assert!(told.stdout.contains("1 of dead runs") && told.stdout.contains("doctor --clean"), "{told:?}");
-    assert!(dead.exists(), "nothing is removed unasked");
-    let cleaned = bench.run(&["doctor", "--seconds", "0", "--clean"]);
-    assert!(cleaned.stdout.contains("leftover domains     none (0 running)"), "{cleaned:?}");
+    let found = leftover_domains(&bench, &[]);
+    assert!(found["verdict"] == "warn" && found["found"].as_str().unwrap().starts_with("1 "), "{found}");
+    assert!(found["remedy"].as_str().unwrap().contains("--clean"), "{found}");
+    assert!(dead.exists(), "removed without --clean");
+    let cleaned = leftover_domains(&bench, &["--clean"]);
+    assert!(cleaned["verdict"] == "ok" && cleaned["found"].as_str().unwrap().contains("(0 "), "{cleaned}");
+    assert!(!dead.exists());
     let running = bench.start(&["run", "--duration", "60"]);
     let alive = domain(&bench);
-    let told = bench.run(&["doctor", "--seconds", "0", "--clean"]);
-    assert!(told.stdout.contains("none (1 running)") && alive.exists(), "{told:?}");
+    let found = leftover_domains(&bench, &["--clean"]);
+    assert!(found["verdict"] == "ok" && found["found"].as_str().unwrap().contains("(1 "), "{found}");
+    assert!(alive.exists());
     running.signal(SIGTERM);
     running.wait();
     bench.assert_clean(&[dead, alive]);
 }
 
 #[test]
-fn a_scenario_that_is_none_is_refused() {
+fn a_missing_scenario_and_a_negative_duration_are_refused() {
     let bench = Bench::new();
     let done = bench.run(&["doctor", "none.toml"]);
-    assert_eq!(done.code, Some(2), "{done:?}");
+    assert!(done.code == Some(2) && done.says("cannot-read-scenario"), "{done:?}");
     assert_eq!(bench.run(&["doctor", "--seconds", "-1"]).code, Some(2));
 }

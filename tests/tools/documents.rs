@@ -1,7 +1,6 @@
-//! Every command of README and of the manual, run as it is typed there, in the order of its page, in one directory per page.
+//! Runs the commands of README and of the manual as they are written, in the order of each page, in a directory per page.
 //!
-//! What is not run here is listed with its reason; a command that is in neither place fails the test. The synopses of
-//! `docs/commands.md` are held against the program's own help.
+//! Commands that are not run here are listed with a reason. The synopses of `docs/commands.md` are compared with the program's help.
 
 use crate::common::{Bench, Done, Running, documented_codes, root};
 use corotate::record::{Recording, SignalInfo};
@@ -10,7 +9,7 @@ use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 
-/// A command by its first words, and where else it is run or why it cannot be.
+/// Commands that are not run here: first words, and where the command is run or why it cannot be.
 const ELSEWHERE: [(&str, &str); 30] = [
     ("corotate run pair.toml --host", "it waits for another host; tests/runs/hosts"),
     ("corotate run pair.toml --clock lockstep --debug", "it waits for a debugger; tests/runs/debugging.rs"),
@@ -36,7 +35,7 @@ const ELSEWHERE: [(&str, &str); 30] = [
     ("qemu-system-arm", "it needs firmware; tests/board"),
     ("socat", "it goes on until it is ended; tests/runs/serial.rs has a line of its own"),
     ("cargo run --release --example serial_device", "it needs a line; tests/runs/serial.rs"),
-    ("corotate watch --once", "beside a run, below"),
+    ("corotate watch --once", "during a run, below"),
     ("corotate watch runs/pair", "a screen that is left by a key; tests/tools/watch.rs, in a terminal"),
     ("corotate watch", "a screen that is left by a key; tests/tools/watch.rs, in a terminal"),
     ("corotate new two-motors", "tests/run"),
@@ -46,15 +45,15 @@ const ELSEWHERE: [(&str, &str); 30] = [
     ("COROTATE_", "a campaign of its own; its short form is in the tests"),
     ("packaging/", "it needs Docker or cargo-deb"),
 ];
-/// What needs a run beside it.
-const BESIDE: [&str; 4] = [
+/// Commands that need a run.
+const DURING_A_RUN: [&str; 4] = [
     "corotate record --out part.mcap",
     "corotate watch --once 0.5",
     "corotate watch --once 0.5 --json",
     "corotate foxglove",
 ];
 
-/// The commands of a page, by line: what stands in a block of code and begins with the name of a program of ours.
+/// Returns the commands of a page with their lines: what begins with the name of one of the programs in a block of code.
 fn commands(text: &str) -> Vec<(usize, String)> {
     let (mut found, mut code, mut before) = (Vec::new(), false, "");
     let mut lines = text.lines().enumerate();
@@ -87,7 +86,7 @@ fn commands(text: &str) -> Vec<(usize, String)> {
             "COROTATE_",
         ];
         let ours = programs.iter().any(|program| command.starts_with(program));
-        // What the program prints, and what a tree of files says, begins as it does.
+        // Output of the program and trees of files begin like commands.
         let printed = command.starts_with("corotate rigid-pair ")
             || command.contains("/            ")
             || command.contains("/             ");
@@ -98,10 +97,10 @@ fn commands(text: &str) -> Vec<(usize, String)> {
     found
 }
 
-/// The page that begins with all synopses.
+/// The page that begins with the synopses.
 const SYNOPSES: &str = "docs/commands.md";
 
-/// A command without its comment.
+/// Strips the comment of a command.
 fn bare(command: &str) -> &str {
     command.split(" #").next().unwrap_or(command).trim_end()
 }
@@ -143,8 +142,8 @@ impl Page {
         self.start(command).wait()
     }
 
-    /// A run of a few seconds to look at, once it has begun.
-    fn beside(&self) -> Running {
+    /// Starts a run of a few seconds and waits for its first ticks.
+    fn start_run(&self) -> Running {
         let run = self.bench.start(&[
             "run",
             "--duration",
@@ -162,7 +161,7 @@ impl Page {
     }
 }
 
-/// The shipped log as three throws.
+/// Returns the shipped log as three throws.
 fn throws(root: &Path) -> String {
     let text = fs::read_to_string(root.join("config/tumbling-throw.csv")).unwrap();
     let mut lines = text.lines().filter(|line| !line.starts_with('#'));
@@ -172,17 +171,17 @@ fn throws(root: &Path) -> String {
     format!("{head},throw\n{}", (1..=3).flat_map(throw).collect::<String>())
 }
 
-/// Runs a page's commands, and gives what failed, by line.
+/// Runs a page's commands and returns those that failed, with their lines.
 fn check(name: &str) -> Vec<String> {
     let text = fs::read_to_string(root().join(name)).unwrap();
-    // The synopses are no commands.
+    // Skips the synopses.
     let first = if name == SYNOPSES { text.lines().position(|line| line.starts_with('|')).unwrap() } else { 0 };
     let page = Page::new();
     let mut failed = Vec::new();
     for (line, command) in commands(&text).into_iter().filter(|(line, _)| *line > first) {
         let typed = bare(&command);
-        let beside = BESIDE.contains(&typed);
-        if !beside
+        let needs_run = DURING_A_RUN.contains(&typed);
+        if !needs_run
             && ELSEWHERE.iter().any(|(start, _)| {
                 typed == *start
                     || typed.starts_with(&format!("{start} "))
@@ -193,9 +192,9 @@ fn check(name: &str) -> Vec<String> {
         }
         let needs = ["--parquet", "foxglove"].into_iter().zip([cfg!(feature = "parquet"), cfg!(feature = "foxglove")]);
         let refused = needs.into_iter().any(|(word, built)| typed.contains(word) && !built);
-        let other = beside.then(|| page.beside());
+        let run = needs_run.then(|| page.start_run());
         let done = page.run(&command);
-        // In real time, beside other tests, a bound may be missed; `doctor` judges the machine, `diff` two runs.
+        // In real time, during other tests, a limit may be missed; `doctor` judges the machine, `diff` two runs.
         let judged = ["corotate run", "corotate doctor", "corotate diff"].iter().any(|start| typed.starts_with(start))
             && !typed.contains("--clock in-process");
         let codes: &[i32] = if refused {
@@ -208,7 +207,7 @@ fn check(name: &str) -> Vec<String> {
         if !done.code.is_some_and(|code| codes.contains(&code)) {
             failed.push(format!("{name}:{line}: {command}\n{done:?}"));
         }
-        other.map(Running::wait);
+        run.map(Running::wait);
     }
     failed
 }
@@ -257,16 +256,16 @@ pages! {
 }
 
 #[test]
-fn every_page_is_tried() {
+fn every_page_has_a_test() {
     let pages = fs::read_dir(root().join("docs")).unwrap();
     let names =
         pages.map(|entry| entry.unwrap().file_name().into_string().unwrap()).filter(|name| name.ends_with(".md"));
     for name in names.filter(|name| !["SUMMARY.md", "glossary.md"].contains(&name.as_str())) {
-        assert!(PAGES.contains(&format!("docs/{name}").as_str()), "docs/{name} is in no test");
+        assert!(PAGES.contains(&format!("docs/{name}").as_str()), "docs/{name} has no test");
     }
 }
 
-/// Every synopsis names a command that exists, and options that it has.
+/// Every synopsis names an existing command and its options.
 #[test]
 fn the_synopses_agree_with_the_help() {
     let bench = Bench::new();
@@ -316,7 +315,7 @@ fn arguments(text: &str) -> Vec<&str> {
     found
 }
 
-/// Returns every code that the sources give an error: by the name of a variant, in a conversion, in a check, or beside its text.
+/// Returns every error code of the sources: the name of a variant, or a literal in a conversion, in a check or next to the text.
 fn codes_written(sources: &str) -> BTreeSet<String> {
     let literal = |text: &str| Some(text.strip_prefix('"')?.split_once('"')?.0.to_owned());
     let after = |before: &'static str| sources.split(before).skip(1);
@@ -352,7 +351,7 @@ fn codes_written(sources: &str) -> BTreeSet<String> {
     codes
 }
 
-/// The manual lists each code that is written in the sources, and none that is in none of them.
+/// The manual lists exactly the codes that the sources use.
 #[test]
 fn the_manual_lists_the_codes_of_all_errors() {
     let (mut sources, mut directories) = (String::new(), vec![root().join("src"), root().join("crates")]);
@@ -382,17 +381,17 @@ fn the_manual_lists_the_codes_of_all_errors() {
 
 /// The layouts for Foxglove and PlotJuggler name fields that a recording of `rigid-pair` has.
 #[test]
-fn the_layouts_name_what_is_recorded() {
+fn the_layouts_name_recorded_fields() {
     let bench = Bench::new();
     bench.run(&["run", "rigid-pair", "--clock", "in-process", "--record", "--out", "run"]).succeeded();
     let recording = Recording::open(&bench.path("run/run.mcap")).unwrap();
     let fields = |between: char| -> Vec<String> {
-        let of = |signal: &SignalInfo| {
+        let names = |signal: &SignalInfo| {
             let topic = format!("/corotate/rigid_pair/{}/{}", signal.body, signal.signal);
             let elements = signal.layout.columns.iter().flat_map(|column| column.elements());
             elements.map(|element| format!("{topic}{between}{element}")).collect::<Vec<_>>()
         };
-        recording.signals().iter().flat_map(of).collect()
+        recording.signals().iter().flat_map(names).collect()
     };
     for (file, between) in [("foxglove.json", '.'), ("plotjuggler.xml", '/')] {
         let text = fs::read_to_string(root().join("packaging/layouts").join(file)).unwrap();

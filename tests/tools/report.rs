@@ -1,4 +1,4 @@
-//! Reports of real runs: whole, well-formed, alone on the network, true to the summary; and what they say to bad input.
+//! Reports of real runs: complete, well-formed, without references to other files, equal to the summary; and refused input.
 
 use crate::common::{self, Bench, Done, shipped, summary_in};
 use corotate::bus::memory::MemoryBus;
@@ -23,7 +23,7 @@ fn report(bench: &Bench, source: &Path, options: &[&str]) -> Done {
     bench.run(&[&["report", source.to_str().unwrap()], options].concat())
 }
 
-/// The page that a report wrote, which must have ended well.
+/// Writes a report, which must succeed, and returns the page.
 fn page(bench: &Bench, source: &Path) -> String {
     let done = report(bench, source, &["--out", "page.html"]);
     assert_eq!((done.code, done.stdout.as_str()), (Some(0), "page.html\n"), "{done:?}");
@@ -47,13 +47,13 @@ fn text(node: Node<'_, '_>) -> String {
     node.descendants().filter(|node| node.is_text()).filter_map(|node| node.text()).collect()
 }
 
-/// The rows of all tables of a section.
+/// Returns the cells of all tables of a section, by row.
 fn rows(section: Node<'_, '_>) -> Vec<Vec<String>> {
     let rows = section.descendants().filter(|node| node.has_tag_name("tr"));
     rows.map(|row| row.children().filter(Node::is_element).map(text).collect()).collect()
 }
 
-/// The page needs nothing beside it, and every picture is one.
+/// Asserts that the page refers to no other file, and that every figure has a path and a label.
 fn check_page(html: &str) {
     for outside in ["http:", "https:", "//", "@import", "url("] {
         assert!(!html.contains(outside), "{outside}");
@@ -62,7 +62,7 @@ fn check_page(html: &str) {
         assert!(!html.contains(&format!("\"{not_drawn}")) && !html.contains(&format!(" {not_drawn}\"")), "{not_drawn}");
     }
     let page = parse(html);
-    assert_eq!(page.descendants().filter(|node| node.has_tag_name("script")).count(), 1, "its own");
+    assert_eq!(page.descendants().filter(|node| node.has_tag_name("script")).count(), 1);
     for node in page.descendants().filter(|node| node.has_tag_name("a") || node.has_tag_name("use")) {
         let target = node.attribute("href").unwrap().strip_prefix('#').unwrap();
         assert!(page.descendants().any(|node| node.attribute("id") == Some(target)), "{target}");
@@ -82,17 +82,17 @@ fn check_page(html: &str) {
     }
 }
 
-/// What the verdict says is what summary.json says, in three digits.
+/// Asserts that the verdict shows the values of summary.json with three digits.
 fn check_verdict(page: &Document<'_>, summary: &Value) {
-    let told = rows(section(page, "verdict"));
+    let shown = rows(section(page, "verdict"));
     let criteria = summary["criteria"].as_array().unwrap();
-    assert_eq!(told.len(), criteria.len() + 1, "a head, and a row for each");
-    for (row, criterion) in told[1..].iter().zip(criteria) {
+    assert_eq!(shown.len(), criteria.len() + 1, "a head, and a row for each criterion");
+    for (row, criterion) in shown[1..].iter().zip(criteria) {
         assert_eq!(row[0], criterion["name"].as_str().unwrap());
         // A count is a whole number.
         let value = criterion["value"].as_f64().unwrap();
-        let shown = if value.fract() == 0.0 { format!("{value}") } else { format!("{value:.2e}") };
-        assert_eq!(row[1], shown, "{row:?}");
+        let digits = if value.fract() == 0.0 { format!("{value}") } else { format!("{value:.2e}") };
+        assert_eq!(row[1], digits, "{row:?}");
         assert_eq!(row[2].parse::<f64>().unwrap(), criterion["limit"].as_f64().unwrap());
         assert_eq!(row[3].contains("holds"), criterion["holds"].as_bool().unwrap());
     }
@@ -121,7 +121,7 @@ fn relabel(from: &Path, to: &Path, old: &str, new: &str) {
 }
 
 #[test]
-fn a_recorded_run_of_bodies_is_shown_whole() {
+fn the_report_of_rigid_bodies_has_all_sections() {
     let bench = Bench::new();
     let directory = run_recorded(&bench, "rigid-pair", &[]);
     let html = page(&bench, &directory);
@@ -131,7 +131,7 @@ fn a_recorded_run_of_bodies_is_shown_whole() {
     let expected = ["verdict", "motion", "errors", "lyapunov", "lateness", "events", "books", "certificate", "machine"];
     assert_eq!(sections(&page), expected);
     check_verdict(&page, &summary);
-    // The metrics that the recording gives are those that the run was judged by.
+    // The metrics recomputed from the recording are those of the summary.
     let metrics = rows(section(&page, "errors"));
     for (row, metric) in metrics[1..].iter().zip(summary["score"]["metrics"].as_array().unwrap()) {
         assert_eq!(row[0], metric["name"].as_str().unwrap());
@@ -146,7 +146,7 @@ fn a_recorded_run_of_bodies_is_shown_whole() {
 }
 
 #[test]
-fn an_orbit_is_shown_beside_its_motion_with_full_state() {
+fn an_orbit_is_drawn_with_its_full_state_motion() {
     let bench = Bench::new();
     let directory = run_recorded(&bench, "orbit-hold", &[]);
     let html = page(&bench, &directory);
@@ -159,12 +159,12 @@ fn an_orbit_is_shown_beside_its_motion_with_full_state() {
     for picture in ["motion in the plane", "r, du", "Vr, du/s", "Vθ, du/s", "Ur, du/s²", "Uθ, du/s²"] {
         assert!(labels.iter().any(|label| label.starts_with(picture)), "{picture}: {labels:?}");
     }
-    // Full state in black, the observer in blue; both begin at the same place and do not go the same way.
+    // Full state in black, observer in blue: two paths from the same point.
     let plane = motion.descendants().find(|node| node.has_tag_name("svg")).unwrap();
     let path = |class: &str| {
-        let of =
+        let drawn =
             |node: &Node<'_, '_>| node.attribute("class") == Some(class) && node.attribute("d").unwrap().len() > 99;
-        plane.descendants().find(of).unwrap().attribute("d").unwrap()
+        plane.descendants().find(drawn).unwrap().attribute("d").unwrap()
     };
     let (full, observed) = (path("line k d0"), path("line b d1"));
     assert_eq!(full.split('L').next(), observed.split('L').next());
@@ -185,16 +185,16 @@ fn faults_and_incidents_are_marked_on_every_time_axis() {
     let marked = |class: &str| marks.descendants().filter(|node| node.attribute("class") == Some(class)).count();
     assert_eq!((marked("fault"), marked("incident")), (12, 1));
     assert_eq!(by_id("names-half").descendants().filter(|node| node.attribute("class") == Some("flag")).count(), 1);
-    // Above the picture that is as wide as the page every one of them is named, and no name lies over another.
+    // Above a figure of full width every mark has a name, and the names do not overlap.
     let names: Vec<Node<'_, '_>> = by_id("names-whole").children().collect();
-    let told: Vec<String> = names.iter().map(|node| text(*node)).collect();
-    assert!(names.len() == 13 && told.contains(&"▾ observer restarted".to_owned()), "{told:?}");
+    let words: Vec<String> = names.iter().map(|node| text(*node)).collect();
+    assert!(names.len() == 13 && words.contains(&"▾ observer restarted".to_owned()), "{words:?}");
     let number = |node: &Node<'_, '_>, name: &str| node.attribute(name).unwrap().parse::<f64>().unwrap();
-    for (index, one) in names.iter().enumerate() {
-        for other in &names[..index] {
-            let length = 5.0 * text(*other).chars().count() as f64;
-            let apart = number(one, "y") != number(other, "y") || number(other, "x") + length < number(one, "x");
-            assert!(apart, "{} and {}", text(*one), text(*other));
+    for (index, right) in names.iter().enumerate() {
+        for left in &names[..index] {
+            let length = 5.0 * text(*left).chars().count() as f64;
+            let apart = number(right, "y") != number(left, "y") || number(left, "x") + length < number(right, "x");
+            assert!(apart, "{} and {}", text(*left), text(*right));
         }
     }
     assert_eq!(summary["incidents"].as_array().unwrap().len(), 1);
@@ -212,7 +212,7 @@ fn faults_and_incidents_are_marked_on_every_time_axis() {
 }
 
 #[test]
-fn what_the_observer_did_not_see_is_marked_on_every_time_axis() {
+fn degraded_estimates_are_marked_on_every_time_axis() {
     let bench = Bench::new();
     let directory = run_recorded(&bench, "gyro-loss", &[]);
     let html = page(&bench, &directory);
@@ -221,15 +221,15 @@ fn what_the_observer_did_not_see_is_marked_on_every_time_axis() {
     let marks = document.descendants().find(|node| node.attribute("id") == Some("marks-half")).unwrap();
     let bands = marks.descendants().filter(|node| node.attribute("class") == Some("unseen"));
     let widths: Vec<f64> = bands.map(|band| band.attribute("width").unwrap().parse().unwrap()).collect();
-    // A quarter of the axis is the loss; at one tick the motion told nothing.
+    // The loss of the axis takes a quarter of the time; at a single tick the motion does not determine the estimate.
     assert!(widths.len() == 2 && widths.iter().any(|width| (130.0..150.0).contains(width)), "{widths:?}");
     assert!(html.contains("grey band: degraded estimate"));
     let lost = summary["score"]["statuses"]["leader/estimate"]["axis_lost"].as_u64().unwrap().to_string();
     let events = rows(section(&document, "events"));
     assert!(events.iter().any(|row| row[..2] == ["axis_lost".to_owned(), lost.clone()]), "{lost}: {events:?}");
-    // A run that saw everything has no such band, and no word of it.
-    let other = Bench::new();
-    let whole = page(&other, &run_recorded(&other, "rigid-pair", &["--duration", "2", "--set", "accept={}"]));
+    // A run without degraded estimates has neither bands nor legend.
+    let intact = Bench::new();
+    let whole = page(&intact, &run_recorded(&intact, "rigid-pair", &["--duration", "2", "--set", "accept={}"]));
     assert!(!whole.contains("class=\"unseen\"") && !whole.contains("rey band"));
 }
 
@@ -248,7 +248,7 @@ fn every_shipped_scenario_has_a_report() {
 }
 
 #[test]
-fn latencies_are_drawn_from_the_histograms_of_the_run() {
+fn latencies_are_drawn_from_the_run_histograms() {
     let bench = Bench::new();
     let file = shipped("rigid-pair");
     let options = ["--tick-hz", "200", "--duration", "1", "--set", "accept={}", "--record", "--out", "out"];
@@ -267,19 +267,17 @@ fn latencies_are_drawn_from_the_histograms_of_the_run() {
         assert_eq!(row[3], stage["missed"].to_string());
         assert_eq!(row[7], format!("{:.2}", stage["max_us"].as_f64().unwrap()));
     }
-    // A row for every role, and shades in it.
+    // A row for every role.
     let strip = text(section(&page, "lateness"));
     assert!(["leader", "follower", "observer", "controller"].iter().all(|role| strip.contains(role)), "{strip}");
     let broken = bench.path("out/latency/leader.step.hgrm");
     std::fs::write(&broken, "Value\n\n1.0 oops\n").unwrap();
     let done = report(&bench, &bench.path("out"), &[]);
-    assert!(
-        done.code == Some(2) && done.stderr.contains("leader.step.hgrm") && done.stderr.contains("line 3"),
-        "{done:?}"
-    );
+    assert!(done.code == Some(2) && done.says("unreadable-latency"), "{done:?}");
+    assert!(["leader.step.hgrm", " 3:"].iter().all(|place| done.stderr.contains(place)), "{done:?}");
 }
 
-/// Every file under a directory.
+/// Returns every file under a directory.
 fn files(directory: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().path());
     entries.flat_map(|path| if path.is_dir() { files(&path) } else { vec![path] }).collect()
@@ -289,14 +287,14 @@ fn run_id(directory: &Path) -> String {
     summary_in(directory)["run"].as_str().unwrap().to_owned()
 }
 
-/// A run of half a second in real time, which has every kind of file.
+/// Runs for half a second in real time, which writes every kind of file.
 fn realtime(bench: &Bench, out: &str, options: &[&str]) -> Done {
     let file = shipped("rigid-pair");
     let common = ["run", file.to_str().unwrap(), "--tick-hz", "200", "--duration", "0.5", "--set", "accept={}"];
     bench.run(&[&common[..], &["--out", out], options].concat())
 }
 
-/// Each file names its run, and the next run into the directory leaves nothing of the one before.
+/// Each file names its run, and the next run into the directory removes the files of the previous one.
 #[test]
 fn a_directory_holds_one_run_whose_files_name_it() {
     let bench = Bench::new();
@@ -320,7 +318,7 @@ fn a_directory_holds_one_run_whose_files_name_it() {
     }
     assert!(found.contains(&out.join("latency/controller.step.hgrm")), "{found:?}");
     std::fs::remove_file(verdict).unwrap();
-    std::fs::write(out.join("latency/nobody.step.hgrm"), format!("# run {first}\n")).unwrap();
+    std::fs::write(out.join("latency/gone.step.hgrm"), format!("# run {first}\n")).unwrap();
     let scenario = out.join("scenario.toml");
     let again = ["run", scenario.to_str().unwrap(), "--out", "out", "--set", "record=false"];
     let refused = bench.run(&again);
@@ -332,12 +330,12 @@ fn a_directory_holds_one_run_whose_files_name_it() {
     assert_ne!(first, second);
     let found = names(&second);
     assert!(!found.iter().any(|file| file.ends_with("run.mcap") || file.ends_with("report.html")), "{found:?}");
-    assert!(!out.join("latency/nobody.step.hgrm").exists());
+    assert!(!out.join("latency/gone.step.hgrm").exists());
 }
 
-/// Files of two runs are never joined, whichever they are; the error names both.
+/// Whichever file is of another run; the error names both.
 #[test]
-fn files_of_two_runs_are_not_shown_as_one() {
+fn files_of_two_runs_are_refused() {
     let bench = Bench::new();
     for out in ["a", "b"] {
         assert_eq!(realtime(&bench, out, &["--record"]).code, Some(0));
@@ -348,22 +346,22 @@ fn files_of_two_runs_are_not_shown_as_one() {
         let own = std::fs::read(a.join(name)).unwrap();
         std::fs::copy(b.join(name), a.join(name)).unwrap();
         let done = report(&bench, &a, &[]);
-        assert_eq!(done.code, Some(2), "{name}: {done:?}");
+        assert!(done.code == Some(2) && done.says("two-runs"), "{name}: {done:?}");
         for word in [name, "summary.json", &run_id(&a), &run_id(&b)] {
             assert!(done.stderr.contains(word), "{name}: {word}: {done:?}");
         }
         std::fs::write(a.join(name), own).unwrap();
     }
-    // One that does not say is not of this run either.
+    // A file that does not name its run is refused, too.
     let scenario = Scenario::load(&a.join("scenario.toml"), &[]).unwrap();
     std::fs::write(a.join("scenario.toml"), scenario.to_toml()).unwrap();
     let done = report(&bench, &a, &[]);
     assert!(done.code == Some(2) && done.says("two-runs"), "{done:?}");
 }
 
-/// A directory with somebody's own files of these names is refused before anything is removed or started.
+/// A directory with the user's own files is refused before anything is removed or started.
 #[test]
-fn a_directory_with_a_file_of_somebody_else_is_refused() {
+fn a_directory_with_a_foreign_file_is_refused() {
     let bench = Bench::new();
     let (out, own) = (bench.path("out"), "# my own scenario\nname = \"mine\"\n");
     assert_eq!(realtime(&bench, "out", &["--record"]).code, Some(0));
@@ -371,14 +369,14 @@ fn a_directory_with_a_file_of_somebody_else_is_refused() {
     let before = files(&out);
     let file = shipped("rigid-pair");
     let done = bench.run(&["run", file.to_str().unwrap(), "--clock", "in-process", "--out", "out"]);
-    assert_eq!(done.code, Some(2), "{done:?}");
+    assert!(done.code == Some(2) && done.says("foreign-file"), "{done:?}");
     assert!(done.stderr.contains("scenario.toml") && done.stderr.contains("--out"), "{done:?}");
     assert_eq!(files(&out), before);
     assert_eq!(std::fs::read_to_string(out.join("scenario.toml")).unwrap(), own);
 }
 
 #[test]
-fn what_is_missing_is_said_with_the_way_to_get_it() {
+fn missing_parts_are_named_with_their_remedy() {
     let bench = Bench::new();
     let directory = run_recorded(&bench, "rigid-pair", &["--duration", "2", "--set", "accept={}"]);
     let done = report(&bench, &directory.join("run.mcap"), &["--out", "alone.html"]);
@@ -395,20 +393,20 @@ fn what_is_missing_is_said_with_the_way_to_get_it() {
     assert!(html.contains("corotate run FILE --record") && !sections(&parse(&html)).contains(&"motion"));
 }
 
-/// Everything that a file says is shown as text, whatever it is.
+/// Shows the contents of files as text, even if they look like markup.
 #[test]
-fn nothing_of_a_file_is_read_as_markup() {
+fn contents_of_files_are_escaped() {
     let bench = Bench::new();
     let directory = run_recorded(&bench, "rigid-pair", &["--duration", "1", "--set", "accept={}"]);
-    let mut told = summary_in(&directory);
+    let mut summary = summary_in(&directory);
     let evil = "</td><script>alert('\"&amp;')</script>\u{1b}";
     for key in ["scenario", "started_utc", "clock"] {
-        told[key] = evil.into();
+        summary[key] = evil.into();
     }
-    told["host"]["cpu"] = evil.into();
-    told["books"]["problems"] = vec![evil].into();
-    told["notes"] = vec![evil].into();
-    std::fs::write(directory.join("summary.json"), told.to_string()).unwrap();
+    summary["host"]["cpu"] = evil.into();
+    summary["books"]["problems"] = vec![evil].into();
+    summary["notes"] = vec![evil].into();
+    std::fs::write(directory.join("summary.json"), summary.to_string()).unwrap();
     let html = page(&bench, &directory);
     check_page(&html);
     let page = parse(&html);
@@ -416,47 +414,48 @@ fn nothing_of_a_file_is_read_as_markup() {
 }
 
 #[test]
-fn bad_input_is_told_and_never_a_panic() {
+fn bad_input_is_refused_without_a_panic() {
     let bench = Bench::new();
     let directory = run_recorded(&bench, "rigid-pair", &["--duration", "2", "--set", "accept={}"]);
     let recording = std::fs::read(directory.join("run.mcap")).unwrap();
-    let told = |source: &Path, code: i32, words: &[&str]| {
+    let assert_refused = |source: &Path, code: &str, words: &[&str]| {
         let done = report(&bench, source, &[]);
-        assert_eq!(done.code, Some(code), "{}: {done:?}", source.display());
+        assert!(done.code == Some(2) && done.says(code), "{}: {done:?}", source.display());
         assert!(words.iter().all(|word| done.stderr.contains(word)) && !done.stderr.contains("panicked"), "{done:?}");
     };
-    told(&bench.path("none"), 2, &["does not exist", "run.mcap"]);
+    assert_refused(&bench.path("missing"), "no-such-run", &["run.mcap"]);
     std::fs::create_dir(bench.path("empty")).unwrap();
-    told(&bench.path("empty"), 2, &["neither summary.json nor run.mcap"]);
+    assert_refused(&bench.path("empty"), "no-results", &["summary.json", "run.mcap"]);
     let file = |name: &str, bytes: &[u8]| {
         std::fs::write(bench.path(name), bytes).unwrap();
         bench.path(name)
     };
-    told(&file("text.mcap", b"no recording"), 2, &["[not-a-recording]"]);
-    told(&file("nothing.mcap", b""), 2, &["[not-a-recording]"]);
+    assert_refused(&file("text.mcap", b"no recording"), "not-a-recording", &[]);
+    assert_refused(&file("empty.mcap", b""), "not-a-recording", &[]);
     relabel(&directory.join("run.mcap"), &bench.path("other.mcap"), "estimate/v2", "estimate/v9");
-    let done = report(&bench, &bench.path("other.mcap"), &[]);
-    assert!(done.code == Some(2) && done.stderr.contains("estimate/v9"), "{done:?}");
-    // Cut anywhere, it is shown as far as it goes and said to be cut, or refused.
+    assert_refused(&bench.path("other.mcap"), "other-layout", &["estimate/v9"]);
+    // A recording that is cut is shown up to there with its number of ticks, or refused.
     for part in [1, 10, 25, 50, 75, 99] {
         let cut = file("cut.mcap", &recording[..recording.len() * part / 100]);
         let done = report(&bench, &cut, &["--out", "cut.html"]);
         let refused = done.code == Some(2) && done.says("not-a-recording");
-        assert!(refused || (done.code == Some(0) && done.stderr.contains("is not complete")), "{part} %: {done:?}");
+        assert!(refused || (done.code == Some(0) && done.stderr.contains("of 2000")), "{part} %: {done:?}");
         assert!(!done.stderr.contains("panicked"), "{done:?}");
     }
     let schema = summary_in(&directory).to_string().replace("summary/v1", "summary/v9");
-    for (text, word) in
-        [(schema.as_str(), "summary/v9"), ("{", "EOF"), ("{\"schema\":\"corotate/summary/v1\"}", "missing")]
-    {
+    for (text, code, word) in [
+        (schema.as_str(), "other-schema", "summary/v9"),
+        ("{", "unreadable-summary", "EOF"),
+        ("{\"schema\":\"corotate/summary/v1\"}", "unreadable-summary", "missing"),
+    ] {
         std::fs::write(directory.join("summary.json"), text).unwrap();
-        told(&directory, 2, &["summary.json", word]);
+        assert_refused(&directory, code, &["summary.json", word]);
     }
     let done = report(&bench, &directory.join("run.mcap"), &["--out", "no/such/directory/page.html"]);
-    assert!(done.code == Some(1) && done.stderr.contains("--out"), "{done:?}");
+    assert!(done.code == Some(1) && done.says("cannot-write") && done.stderr.contains("--out"), "{done:?}");
 }
 
-/// A million ticks, written straight to a recording: a page of less than 2 MB, in which a spike of one tick is seen.
+/// A recording of a million ticks gives a page of less than 2 MB that shows a spike of a single tick.
 #[test]
 fn a_million_ticks_fit_in_two_megabytes_with_every_spike() {
     use corotate::sample::{RateCommand, RateEstimate, RateMeasurement, RateTruth};
@@ -493,9 +492,9 @@ fn a_million_ticks_fit_in_two_megabytes_with_every_spike() {
             .send(|sample| *sample = RateEstimate { stamp, omega_rad_s: omega, ..RateEstimate::default() })
             .unwrap();
         let v = noise(tick, 3).abs() + 1e-3;
-        let said =
+        let sent =
             RateCommand { stamp, acceleration_rad_s2: [0.0; 3], lyapunov_rad2_s2: v, lyapunov_rate_bound_rad2_s3: -v };
-        command.send(|sample| *sample = said).unwrap();
+        command.send(|sample| *sample = sent).unwrap();
         recorder.poll().unwrap();
     }
     recorder.finish(&[], None);
@@ -509,9 +508,9 @@ fn a_million_ticks_fit_in_two_megabytes_with_every_spike() {
     assert!(text(first).contains('5'), "the axis reaches the spike");
 }
 
-/// What an identifier learns, what noisy sensors say, and any field by its name.
+/// Draws the coefficients of an identifier, noisy measurements, and fields chosen with --show.
 #[test]
-fn coefficients_measurements_and_fields_on_demand_are_drawn() {
+fn coefficients_measurements_and_chosen_fields_are_drawn() {
     let bench = Bench::new();
     let labels = |html: &str| -> Vec<String> {
         let page = parse(html);
@@ -535,14 +534,14 @@ fn coefficients_measurements_and_fields_on_demand_are_drawn() {
     assert!(unknown.says("no-such-field") && unknown.stderr.contains("leader/truth.omega_rad_s"));
 }
 
-/// Two runs over each other: the first difference is the one that `diff` finds, and is marked on every time axis.
+/// The first difference is the one that `diff` finds, and is marked on every time axis.
 #[test]
-fn two_runs_are_shown_over_each_other() {
+fn a_comparison_shows_the_first_difference_of_two_runs() {
     let bench = Bench::new();
     let (plain, faulted) = (run_recorded(&bench, "rigid-pair", &[]), bench.path("other"));
-    let other = ["run", "rigid-pair", "--clock", "in-process", "--record", "--out", faulted.to_str().unwrap()];
+    let run = ["run", "rigid-pair", "--clock", "in-process", "--record", "--out", faulted.to_str().unwrap()];
     let fault = ["--set", r#"fault=[{kind="drop",role="observer",from_tick=4000,ticks=5}]"#];
-    assert!(matches!(bench.run(&[&other[..], &fault].concat()).code, Some(0 | 3)));
+    assert!(matches!(bench.run(&[&run[..], &fault].concat()).code, Some(0 | 3)));
     let pair = |b: &Path| {
         let done = report(&bench, &plain, &[b.to_str().unwrap(), "--show", "leader/estimate.omega_rad_s"]);
         assert_eq!((done.code, done.stdout.as_str()), (Some(0), "comparison.html\n"), "{done:?}");
@@ -559,19 +558,19 @@ fn two_runs_are_shown_over_each_other() {
     let words = text(section(&page, "differences"));
     assert!((4000..4010).contains(&first) && words.contains(&format!("at tick {first} ")), "{first}: {words}");
     assert!(html.contains("first difference</text>") && html.contains("leader, A") && html.contains("leader, B"));
-    // The comparison names each key that was changed, and nothing else.
+    // The comparison names exactly the changed keys.
     let differing = rows(section(&page, "scenarios"));
     let keys: Vec<&str> = differing[1..].iter().map(|row| row[0].as_str()).collect();
     assert_eq!(keys, ["from_tick", "kind", "probability", "role", "ticks"].map(|key| format!("fault[0].{key}")));
     assert_eq!(differing[1][1..], ["–", "4000"]);
-    // A run and itself.
+    // A run compared with itself.
     let same = pair(&plain);
     assert!(same.contains("✓ no value differs") && !same.contains("first difference</text>"));
     let same = parse(&same);
     assert!(
         rows(section(&same, "scenarios")).is_empty() && text(section(&same, "scenarios")).contains("same scenario")
     );
-    // Without recordings there is what was told.
+    // Without recordings only the summaries are compared.
     assert_eq!(bench.run(&["run", "rigid-pair", "--clock", "in-process", "--out", "bare"]).code, Some(0));
     let bare = pair_without_fields(&bench, &plain, &bench.path("bare"));
     assert!(bare.contains("only recorded runs have samples"), "{bare}");
@@ -585,9 +584,9 @@ fn pair_without_fields(bench: &Bench, a: &Path, b: &Path) -> String {
     std::fs::read_to_string(bench.path("pair.html")).unwrap()
 }
 
-/// For papers: each with its colours in place, readable by what knows no page.
+/// For papers: each figure is an SVG file with its own colours.
 #[test]
-fn every_figure_is_a_picture_of_its_own() {
+fn figures_are_written_as_separate_files() {
     let bench = Bench::new();
     let directory = run_recorded(&bench, "faults", &[]);
     report(&bench, &directory, &["--figures", "figures"]).succeeded();
@@ -602,21 +601,21 @@ fn every_figure_is_a_picture_of_its_own() {
     }
 }
 
-/// Moves a pointer over the first picture over time and drags it over a part; what comes of it is told in the title.
+/// Moves a pointer over the first time plot and drags it over a part; writes the results into the title.
 const READER: &str = r#"<script>
 const svg = document.querySelector("svg.time"), box = svg.getBoundingClientRect();
 const at = (kind, part) => svg.dispatchEvent(new PointerEvent(kind, { clientX: box.left + part * box.width, clientY: box.top + box.height / 2, bubbles: true }));
 at("pointermove", 0.5);
-const told = svg.closest("figure").querySelector(".readout").textContent;
+const readout = svg.closest("figure").querySelector(".readout").textContent;
 at("pointerdown", 0.4); at("pointermove", 0.5); at("pointerup", 0.6);
 const ticks = [...svg.querySelectorAll("g.ticks text")].map((text) => text.textContent).join(" ");
-const other = [...document.querySelectorAll("svg.time")].at(-1).querySelector("svg.plot").getAttribute("viewBox");
+const last = [...document.querySelectorAll("svg.time")].at(-1).querySelector("svg.plot").getAttribute("viewBox");
 svg.dispatchEvent(new MouseEvent("dblclick"));
 const back = [...document.querySelectorAll("svg.plot")].every((plot) => plot.getAttribute("viewBox").startsWith("64 "));
-document.title = [told, ticks, !other.startsWith("64 ") && back, svg.querySelectorAll("g.ticks text").length].join("|");
+document.title = [readout, ticks, !last.startsWith("64 ") && back, svg.querySelectorAll("g.ticks text").length].join("|");
 </script></body>"#;
 
-/// Returns a page as a browser has it once its scripts have run; none where there is no browser.
+/// Returns a page after a browser has run its scripts; `None` without a browser.
 fn in_browser(bench: &Bench, html: &str) -> Option<String> {
     let browser = ["chromium", "chromium-browser", "google-chrome"].into_iter().find(|name| {
         std::process::Command::new(name).arg("--version").output().is_ok_and(|output| output.status.success())
@@ -633,10 +632,10 @@ fn in_browser(bench: &Bench, html: &str) -> Option<String> {
     Some(dom)
 }
 
-/// Looks at every page in a frame, and tells in the title what of it is out of sight, or too small to be read.
+/// Measures every page in a frame; writes into the title what is cut off or too small to be read.
 const MEASURE: &str = r#"<script>
 addEventListener("load", () => {
-  const told = [...document.querySelectorAll("iframe")].flatMap((frame) => {
+  const defects = [...document.querySelectorAll("iframe")].flatMap((frame) => {
     const page = frame.contentDocument, width = frame.contentWindow.innerWidth;
     const seen = (selector) => [...page.querySelectorAll(selector)].filter((node) => node.getBoundingClientRect().width > 0);
     const cut = (node) => node.getBoundingClientRect().right > width || node.closest(".table, figure").scrollWidth > node.closest(".table, figure").clientWidth;
@@ -649,12 +648,12 @@ addEventListener("load", () => {
     if (!seen("figure svg").length) found.push("every picture");
     return found.map((name) => `${frame.title} at ${width}: ${name}`);
   });
-  document.title = `${document.querySelectorAll("iframe").length} pages;` + told.join("; ");
+  document.title = `${document.querySelectorAll("iframe").length} pages;` + defects.join("; ");
 });
 </script>"#;
 
 #[test]
-fn in_a_browser_every_page_has_room_on_a_phone_and_on_a_screen() {
+fn in_a_browser_every_page_fits_a_phone_and_a_screen() {
     let bench = Bench::new();
     let (faulted, plain) =
         (run_recorded(&bench, "faults", &[]), run_recorded(&bench, "rigid-pair", &["--duration", "9"]));
@@ -670,7 +669,7 @@ fn in_a_browser_every_page_has_room_on_a_phone_and_on_a_screen() {
     let estimate = ["estimate", "log.csv", "--hidden", "z", "--inertia", "1,2,2.5", "--page", "log.html"];
     assert_eq!(bench.run(&estimate).code, Some(0));
     let log = std::fs::read_to_string(bench.path("log.html")).unwrap();
-    // Input, method, result: three paragraphs of whole sentences, and no verdict.
+    // Input, method and result are three paragraphs; there is no verdict.
     let paragraphs = section(&parse(&log), "result").children().filter(|node| node.has_tag_name("p")).count();
     assert!(paragraphs == 3 && !log.contains("class=\"verdict"), "{paragraphs}");
     let pages = [
@@ -696,7 +695,7 @@ fn in_a_browser_every_page_has_room_on_a_phone_and_on_a_screen() {
 }
 
 #[test]
-fn in_a_browser_pictures_over_time_tell_their_values_and_are_looked_at_closely() {
+fn in_a_browser_time_plots_show_values_and_zoom_together() {
     let bench = Bench::new();
     let html = page(&bench, &run_recorded(&bench, "rigid-pair", &[]));
     let Some(dom) = in_browser(&bench, &html.replace("</body>", READER)) else {
@@ -704,10 +703,10 @@ fn in_a_browser_pictures_over_time_tell_their_values_and_are_looked_at_closely()
     };
     let title = dom.split("<title>").nth(1).and_then(|rest| rest.split("</title>").next()).unwrap_or_default();
     let parts: Vec<&str> = title.split('|').collect();
-    let [told, ticks, same, all] = parts[..] else { panic!("{title}") };
-    // The middle of the picture is a little before the middle of its axis, by the margins.
-    assert!(told.starts_with("t = 4.6") && told.contains("; leader: ") && told.contains("; observer: "), "{told}");
+    let [readout, ticks, same, all] = parts[..] else { panic!("{title}") };
+    // Because of the margins, the middle of the plot is a little before the middle of its axis.
+    assert!(readout.contains("4.6") && readout.contains("leader:") && readout.contains("observer:"), "{readout}");
     let closer: Vec<f64> = ticks.split(' ').map(|tick| tick.parse().unwrap()).collect();
     assert!(closer.len() > 3 && closer[0] > 3.0 && closer[closer.len() - 1] < 6.5, "{ticks}");
-    assert_eq!((same, all), ("true", "6"), "all pictures together, there and back");
+    assert_eq!((same, all), ("true", "6"), "all plots zoom together, in and out");
 }

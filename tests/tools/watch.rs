@@ -1,11 +1,11 @@
-//! `corotate watch` in a real terminal, tmux, beside a running loop.
+//! `corotate watch` in a real terminal (tmux) during a run.
 
 use crate::common::{self, Bench, WATCHDOG, await_some};
 use libc::{SIGINT, SIGKILL, SIGTERM};
 use std::process::Command;
 use std::time::Instant;
 
-/// A tmux server of its own, with one window of 80 by 24 in which a shell runs.
+/// A tmux server with a window of 80 by 24 characters in which a shell runs.
 struct Terminal<'a> {
     bench: &'a Bench,
     socket: String,
@@ -17,7 +17,7 @@ impl<'a> Terminal<'a> {
         let terminal = Self { bench, socket };
         terminal.tmux(&["-f", "/dev/null", "new-session", "-d", "-x", "80", "-y", "24", "sh"]);
         terminal.tmux(&["set-option", "-g", "status", "off"]);
-        // Whatever the shell's own prompt is, this one is looked for.
+        // A known prompt replaces the shell's own.
         terminal.enter("PS1='ready> '; clear");
         terminal.await_text("ready>");
         terminal
@@ -25,7 +25,7 @@ impl<'a> Terminal<'a> {
 
     fn tmux(&self, arguments: &[&str]) -> String {
         let mut command = self.bench.command_of("tmux".as_ref());
-        // A test that runs within tmux is not to find that one.
+        // A tmux around the test must not be found.
         let output = command.env_remove("TMUX").args(["-S", &self.socket]).args(arguments).output();
         let output = output.expect("tmux is missing: tests/run installs it (Debian: apt install tmux)");
         assert!(output.status.success(), "tmux {arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
@@ -44,7 +44,7 @@ impl<'a> Terminal<'a> {
         self.tmux(&["capture-pane", "-p"])
     }
 
-    /// The screen as soon as it is as it should be.
+    /// Waits until the screen satisfies `wanted`, and returns it.
     fn await_screen(&self, what: &str, wanted: impl Fn(&str) -> bool) -> String {
         let end = Instant::now() + WATCHDOG;
         loop {
@@ -61,14 +61,14 @@ impl<'a> Terminal<'a> {
         self.await_screen(text, |screen| screen.contains(text))
     }
 
-    /// Whether the program has the screen behind the shell's, and the cursor is hidden.
+    /// Returns true if a tmux flag of the window is set, for example of the alternate screen or the cursor.
     fn flag(&self, name: &str) -> bool {
         self.tmux(&["display-message", "-p", &format!("#{{{name}}}")]).trim() == "1"
     }
 
     fn assert_restored(&self) {
         self.await_screen("the shell's screen", |_| !self.flag("alternate_on"));
-        assert!(self.flag("cursor_flag"), "the cursor is seen again");
+        assert!(self.flag("cursor_flag"), "the cursor is visible again");
         self.enter("stty -a | grep -o ' icanon\\| echo ' | tr -d '\\n'; echo \"=$?\"");
         self.await_text("icanon echo =0");
     }
@@ -76,12 +76,12 @@ impl<'a> Terminal<'a> {
 
 impl Drop for Terminal<'_> {
     fn drop(&mut self) {
-        // Only ours: the socket is.
+        // Ends only the server of this socket.
         let _ = Command::new("tmux").env_remove("TMUX").args(["-S", &self.socket, "kill-server"]).output();
     }
 }
 
-/// The words of the line that begins with this word.
+/// Returns the words of the line that begins with the word `first`.
 fn line(screen: &str, first: &str) -> Vec<String> {
     let lines = screen.lines().map(|line| line.split_whitespace().map(str::to_owned).collect::<Vec<_>>());
     lines.into_iter().find(|words| words.first().is_some_and(|word| word == first)).unwrap_or_default()
@@ -91,7 +91,7 @@ fn tick(screen: &str, role: &str) -> Option<u64> {
     line(screen, role).get(3)?.parse().ok()
 }
 
-/// The number below the name of a metric.
+/// Returns the number below the name of a metric.
 fn value(screen: &str, metric: &str) -> Option<f64> {
     screen.lines().skip_while(|line| !line.starts_with(metric)).nth(1)?.split_whitespace().next()?.parse().ok()
 }
@@ -99,7 +99,7 @@ fn value(screen: &str, metric: &str) -> Option<f64> {
 const RUN: [&str; 7] = ["run", "--duration", "60", "--tick-hz", "100", "--set", "realtime.lock_memory=false"];
 
 #[test]
-fn the_screen_tells_of_the_loop_and_gives_the_terminal_back() {
+fn the_screen_shows_the_loop_and_restores_the_terminal() {
     let bench = Bench::new();
     let run = bench.start(&[&RUN[..], &["--json"]].concat());
     let domain = await_some(|| bench.domains().pop());
@@ -118,19 +118,19 @@ fn the_screen_tells_of_the_loop_and_gives_the_terminal_back() {
         assert_eq!(words[2], "1", "the first life: {words:?}");
         assert!(words[6].contains('/'), "lateness: {words:?}");
     }
-    assert!(running(&first)[2][7].contains('/') && running(&first)[0][7] == "-", "a leader waits for nobody: {first}");
+    assert!(running(&first)[2][7].contains('/') && running(&first)[0][7] == "-", "the leader has no input: {first}");
 
-    // Ticks go on and the errors fall by the design's rate, which is more than a decade per second.
+    // Ticks continue, and the errors fall at the design rate, more than a decade per second.
     let started = tick(&first, "leader").unwrap();
     let later =
-        terminal.await_screen("ticks going on", |screen| tick(screen, "leader").is_some_and(|t| t > started + 300));
+        terminal.await_screen("later ticks", |screen| tick(screen, "leader").is_some_and(|t| t > started + 300));
     for metric in ["sync_error_rad_s", "estimate_error_rad_s"] {
         let (before, after) = (value(&first, metric).unwrap(), value(&later, metric).unwrap());
         assert!(after < before.max(1e-9), "{metric}: {before:e}, then {after:e}\n{later}");
     }
     assert!(later.contains(">leader/measurement"), "{later}");
 
-    // A signal is selected, and stands still while the loop goes on.
+    // A signal is selected; the paused screen does not change while the loop runs.
     terminal.press("Up");
     terminal.await_text(">follower/command");
     terminal.await_text("acceleration_rad_s2");
@@ -140,13 +140,13 @@ fn the_screen_tells_of_the_loop_and_gives_the_terminal_back() {
     let still = terminal.screen();
     assert_eq!(tick(&paused, "leader"), tick(&still, "leader"));
     terminal.press("Space");
-    terminal.await_screen("ticks going on", |screen| tick(screen, "leader") > tick(&still, "leader"));
+    terminal.await_screen("later ticks", |screen| tick(screen, "leader") > tick(&still, "leader"));
 
-    // Below the names are the fields of the marked signal; no line has a signal's name and a value.
+    // Below the names are the fields of the selected signal.
     let marked = terminal.screen();
     assert!(line(&marked, "acceleration_rad_s2").len() == 4 && line(&marked, "omega_rad_s").is_empty(), "{marked}");
 
-    // It follows the window's size.
+    // The screen follows the window's size.
     terminal.tmux(&["resize-window", "-x", "100", "-y", "40"]);
     terminal.await_screen("a screen of 40 lines", |screen| {
         screen.lines().count() == 40 && screen.lines().nth(39).is_some_and(|l| l.contains("q quit"))
@@ -156,7 +156,7 @@ fn the_screen_tells_of_the_loop_and_gives_the_terminal_back() {
     terminal.assert_restored();
     terminal.enter("echo code=$?");
 
-    // The loop has not noticed: it ends in order, with books that balance.
+    // The loop is undisturbed: it ends in order, and its counters balance.
     run.signal(SIGINT);
     let done = run.wait();
     let summary = done.json();
@@ -166,7 +166,7 @@ fn the_screen_tells_of_the_loop_and_gives_the_terminal_back() {
 }
 
 #[test]
-fn a_signal_gives_the_terminal_back_and_the_end_of_the_run_is_told() {
+fn a_signal_restores_the_terminal_and_the_end_of_the_run_is_shown() {
     let bench = Bench::new();
     let run = bench.start(&RUN);
     let domain = await_some(|| bench.domains().pop());
@@ -187,14 +187,14 @@ fn a_signal_gives_the_terminal_back_and_the_end_of_the_run_is_told() {
     run.signal(SIGTERM);
     assert_eq!(run.wait().code, Some(143));
     let ended = terminal.await_text("ended");
-    assert!(tick(&ended, "controller").is_some_and(|tick| tick > 0), "what was last seen stays: {ended}");
+    assert!(tick(&ended, "controller").is_some_and(|tick| tick > 0), "the last values stay: {ended}");
     terminal.press("q");
     terminal.await_text("code=0");
     drop(terminal);
     bench.assert_clean(&[domain]);
 }
 
-/// As when a connection breaks: nobody is left to press q.
+/// As when a connection breaks, and q cannot be pressed.
 #[test]
 fn a_watcher_ends_with_its_terminal() {
     let bench = Bench::new();
@@ -213,9 +213,9 @@ fn a_watcher_ends_with_its_terminal() {
     bench.assert_clean(&[domain]);
 }
 
-/// A watcher that is killed leaves nothing that outlives the run.
+/// Nothing of it outlives the run.
 #[test]
-fn a_killed_watcher_leaves_nothing() {
+fn a_killed_watcher_leaves_no_files() {
     let bench = Bench::new();
     let run = bench.start(&RUN);
     let domain = await_some(|| bench.domains().pop());
@@ -232,7 +232,7 @@ fn a_killed_watcher_leaves_nothing() {
 
 /// The run waits for its observer, and the watcher for the run.
 #[test]
-fn a_watcher_that_waits_for_a_run_ends_when_it_is_told() {
+fn a_watcher_that_waits_for_a_run_ends_on_sigterm() {
     let bench = Bench::new();
     let run = bench.start(&["run", "--clock", "lockstep", "--external", "observer"]);
     let domain = await_some(|| bench.domains().pop());
@@ -242,12 +242,12 @@ fn a_watcher_that_waits_for_a_run_ends_when_it_is_told() {
     await_some(|| std::fs::rename(&there, &aside).ok());
     let watcher = bench.start(&["watch", domain.to_str().unwrap(), "--once", "1"]);
     await_some(|| common::catches(watcher.pid(), 15).then_some(()));
-    let told = Instant::now();
+    let signalled = Instant::now();
     watcher.signal(SIGTERM);
     let done = watcher.wait();
     assert_eq!(done.code, Some(143), "{done:?}");
     assert!(done.stdout.is_empty() && done.stderr.is_empty(), "{done:?}");
-    println!("ended after {:.1} s", told.elapsed().as_secs_f64());
+    println!("ended after {:.1} s", signalled.elapsed().as_secs_f64());
     std::fs::rename(&aside, &there).unwrap();
     run.signal(SIGTERM);
     run.wait();
@@ -255,7 +255,7 @@ fn a_watcher_that_waits_for_a_run_ends_when_it_is_told() {
 }
 
 #[test]
-fn one_screen_can_be_had_without_a_terminal() {
+fn once_prints_a_screen_without_a_terminal() {
     let bench = Bench::new();
     let run = bench.start(&["run", "--duration", "60", "--clock", "realtime", "--tick-hz", "200"]);
     let domain = await_some(|| bench.domains().pop());
@@ -263,15 +263,15 @@ fn one_screen_can_be_had_without_a_terminal() {
     assert_eq!(done.stdout.lines().count(), 24);
     assert_eq!(line(&done.stdout, "observer")[1], "running", "{}", done.stdout);
     let refused = bench.run(&["watch", domain.to_str().unwrap()]);
-    assert!(refused.code == Some(2) && refused.stderr.contains("--once"), "{refused:?}");
+    assert!(refused.code == Some(2) && refused.says("no-terminal") && refused.stderr.contains("--once"), "{refused:?}");
     run.signal(SIGTERM);
     run.wait();
     bench.assert_clean(&[domain]);
 }
 
-/// Of two runs the one whose results go to the directory that is named; its domain is nobody's business.
+/// Finds each of two runs by its results directory, without its domain.
 #[test]
-fn a_run_is_found_by_the_directory_of_its_results() {
+fn a_run_is_found_by_its_results_directory() {
     let bench = Bench::new();
     let start = |out: &str, hz: &str| {
         let quiet = ["--tick-hz", hz, "--duration", "600", "--set", "accept={}", "--set", "limits={}"];
@@ -279,15 +279,22 @@ fn a_run_is_found_by_the_directory_of_its_results() {
     };
     let runs = [start("slow", "100"), start("other", "200")];
     for (out, ticks) in [("slow", 60_000), ("other", 120_000)] {
-        // It may not be there yet.
-        let told: serde_json::Value = await_some(|| {
+        // The run may not have begun.
+        let watched: serde_json::Value = await_some(|| {
             let done = bench.run(&["watch", out, "--once", "0.5", "--json"]);
             (done.code == Some(0)).then(|| done.json())
         });
-        assert_eq!((&told["schema"], &told["last_tick"]), (&"corotate/watch/v1".into(), &ticks.into()), "{told}");
-        let (roles, errors) = (told["roles"].as_array().unwrap(), told["errors"].as_object().unwrap());
-        assert!(roles.len() == 4 && roles.iter().all(|role| role["tick"].is_u64()), "{told}");
-        assert!(errors.contains_key("sync_error_rad_s") && !told["signals"].as_object().unwrap().is_empty(), "{told}");
+        assert_eq!(
+            (&watched["schema"], &watched["last_tick"]),
+            (&"corotate/watch/v1".into(), &ticks.into()),
+            "{watched}"
+        );
+        let (roles, errors) = (watched["roles"].as_array().unwrap(), watched["errors"].as_object().unwrap());
+        assert!(roles.len() == 4 && roles.iter().all(|role| role["tick"].is_u64()), "{watched}");
+        assert!(
+            errors.contains_key("sync_error_rad_s") && !watched["signals"].as_object().unwrap().is_empty(),
+            "{watched}"
+        );
     }
     for run in runs {
         run.signal(SIGTERM);
@@ -298,12 +305,12 @@ fn a_run_is_found_by_the_directory_of_its_results() {
 }
 
 #[test]
-fn without_a_run_there_is_nothing_to_watch() {
+fn without_a_run_watch_is_refused() {
     let bench = Bench::new();
-    let none = bench.run(&["watch", "--once"]);
-    assert!(none.code == Some(2) && none.says("no-run"), "{none:?}");
-    let other = bench.run(&["watch", "/tmp", "--once"]);
-    assert!(other.code == Some(2) && other.says("not-a-domain"), "{other:?}");
+    let idle = bench.run(&["watch", "--once"]);
+    assert!(idle.code == Some(2) && idle.says("no-run"), "{idle:?}");
+    let directory = bench.run(&["watch", "/tmp", "--once"]);
+    assert!(directory.code == Some(2) && directory.says("not-a-domain"), "{directory:?}");
 }
 
 fn arguments(pid: u32) -> Vec<String> {
