@@ -22,10 +22,10 @@ pub struct LogArguments {
     /// Unit of the rates: rad/s or deg/s [default: from the columns' names, else rad/s]
     #[arg(long, value_name = "UNIT", value_parser = rate_unit, hide_short_help = true)]
     rate_unit: Option<RateUnit>,
-    /// Begin a new segment when the value in this column changes
+    /// Begin a segment where this column changes
     #[arg(long, value_name = "NAME")]
     by: Option<String>,
-    /// Begin a new segment after a longer pause, s [default: 5 usual intervals]
+    /// Begin a segment after a longer pause, s [default: 5 usual intervals]
     #[arg(long, value_name = "S", allow_negative_numbers = true, hide_short_help = true)]
     gap: Option<f64>,
     /// The first row is data; name columns by number, from 1

@@ -97,7 +97,7 @@ fn overview(line: &clap::Command) -> String {
     let mut column = 0;
     for name in rest {
         if column == 0 || column + name.len() + 1 > WIDTH {
-            let _ = write!(text, "{}", if column == 0 { "  and: " } else { "\n      " });
+            let _ = write!(text, "{}", if column == 0 { "  and:" } else { "\n      " });
             column = 6;
         }
         let _ = write!(text, " {name}");
