@@ -50,16 +50,16 @@ def test_the_seed_determines_the_noise(tmp_path):
 
 def test_wrong_calls_raise():
     env = corotate.Env("rigid-pair", set={"duration_s": 0.01})
-    with pytest.raises(RuntimeError, match="reset"):
+    with pytest.raises(RuntimeError, match=r"\breset\(\)"):
         env.step(np.zeros(3))
     env.reset()
-    with pytest.raises(ValueError, match="3 numbers"):
+    with pytest.raises(ValueError, match=r"\b3\b.*\b2\b"):
         env.step(np.zeros(2))
     while not env.step(np.zeros(3))[3]:
         pass
-    with pytest.raises(corotate.CorotateError, match="over"):
+    with pytest.raises(corotate.CorotateError, match=r"\breset\(\)"):
         env.step(np.zeros(3))
-    with pytest.raises(corotate.CorotateError, match="no controller"):
+    with pytest.raises(corotate.CorotateError, match=r"\bcontroller\b"):
         corotate.Env("inertia")
 
 
@@ -87,7 +87,7 @@ def test_every_scenario_that_can_be_stepped_is_registered():
         try:
             return bool(corotate.Env(name))
         except corotate.CorotateError as error:
-            assert "cannot be stepped" in str(error)
+            assert "stepped" in str(error)
 
     assert [name for name in corotate.shipped() if can_be_stepped(name)] == [name for name in corotate.shipped() if name in SCENARIOS]
     assert not set(SCENARIOS) - set(corotate.shipped())
@@ -143,7 +143,7 @@ def test_an_episode_ends_where_a_body_leaves_its_model():
         assert np.isfinite(reward) and np.isfinite(observation).all() and not truncated
         assert terminated == ("reason" in info)
     assert info["reason"] == "spacecraft meets the central body" and steps < 10_000
-    with pytest.raises(corotate.CorotateError, match="over"):
+    with pytest.raises(corotate.CorotateError, match=r"\breset\(\)"):
         env.step([0.0, 0.0])
     assert env.summary()["accepted"] is False
     env.reset()
@@ -192,14 +192,14 @@ def test_an_environment_is_copied_without_its_episode(copied):
     env.reset(seed=1)
     env.step(np.zeros(3))
     copy_of_env = copied(env)
-    with pytest.raises(RuntimeError, match="reset"):
+    with pytest.raises(RuntimeError, match=r"\breset\(\)"):
         copy_of_env.step(np.zeros(3))
     assert noise(copy_of_env, 2) == noise(env, 2), "the generator is copied"
 
 
 def test_the_summary_of_an_episode_has_the_scenario_s_criteria():
     env = corotate.Env("rigid-pair", set={"duration_s": 9})
-    with pytest.raises(RuntimeError, match="reset"):
+    with pytest.raises(RuntimeError, match=r"\breset\(\)"):
         env.summary()
     env.reset(seed=1)
     while not env.step(np.zeros(3))[3]:
@@ -209,7 +209,7 @@ def test_the_summary_of_an_episode_has_the_scenario_s_criteria():
     assert summary["accepted"] is run.accepted is False and env.summary() == summary
     assert [(each["name"], each["limit"]) for each in summary["criteria"]] == [(each["name"], each["limit"]) for each in run.summary["criteria"]]
     assert len(summary["criteria"]) > 1 and summary["state"]["hash"] == run.hash and summary["books"]["balanced"]
-    with pytest.raises(RuntimeError, match="reset"):
+    with pytest.raises(RuntimeError, match=r"\breset\(\)"):
         env.step(np.zeros(3))
     # An unfinished episode has no verdict.
     env.reset()

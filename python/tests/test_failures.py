@@ -63,9 +63,10 @@ def test_exit_interrupt_and_unpicklable_exceptions_reach_the_caller(tmp_path, wh
 
 
 def test_a_dead_role_process_raises_with_its_exit_code(tmp_path):
-    with pytest.raises(corotate.CorotateError, match="exit code 7") as caught:
+    with pytest.raises(corotate.CorotateError, match=r"\bcontroller\b.*\b7\b") as caught:
         run(tmp_path, "lockstep", "process", Fails("die", 5))
-    assert caught.value.run.summary["incidents"][0]["tick"] == 5
+    [incident] = caught.value.run.summary["incidents"]
+    assert (incident["role"], incident["tick"], incident["action"]) == ("controller", 5, "stopped")
 
 
 def test_a_function_that_cannot_be_pickled_raises(tmp_path):
@@ -119,10 +120,11 @@ def test_lockstep_waits_for_a_slow_function_up_to_the_external_timeout(tmp_path)
     ended = run(tmp_path, "lockstep", "thread", slow, set=brief)
     assert ended.summary["incidents"] == [] and ended.summary["books"]["roles"]["controller"]["executed"] == 51
     limited = {**brief, "launch.external_timeout_s": 0.5}
-    with pytest.raises(corotate.CorotateError, match="0.5 s") as caught:
+    with pytest.raises(corotate.CorotateError, match=r"\b0\.5 s\b") as caught:
         corotate.run("rigid-pair", set={**ENDLESS, **limited}, roles={"controller": slow}, out=tmp_path / "limited")
     [incident] = caught.value.run.summary["incidents"]
-    assert incident["tick"] == 5 and caught.value.run.accepted is False
+    assert (incident["role"], incident["tick"], incident["code"]) == ("controller", 5, "waited-too-long")
+    assert caught.value.run.accepted is False
 
 
 def test_the_incident_of_a_silent_function_has_its_current_tick(tmp_path):
@@ -135,6 +137,7 @@ def test_the_incident_of_a_silent_function_has_its_current_tick(tmp_path):
     with pytest.raises(corotate.CorotateError, match="controller") as caught:
         run(tmp_path, "realtime", "thread", hangs, set={"supervision.heartbeat_timeout_s": 3.0})
     [incident] = caught.value.run.summary["incidents"]
+    assert (incident["role"], incident["code"], incident["action"]) == ("controller", "silent", "stopped")
     # Ticks missed between the last two calls are not finished either.
     finished, began = seen[-2:]
     assert finished < incident["tick"] <= began
@@ -144,6 +147,8 @@ def test_a_run_that_lost_a_built_in_role_raises(tmp_path):
     kill = {"supervision.on_failure": "stop", "fault": [{"kind": "kill", "role": "observer", "from_tick": 50}]}
     with pytest.raises(corotate.CorotateError, match="observer") as caught:
         corotate.run("rigid-pair", set={**ENDLESS, **kill}, out=tmp_path / "run")
+    [incident] = caught.value.run.summary["incidents"]
+    assert (incident["role"], incident["code"], incident["action"]) == ("observer", "killed", "stopped")
     assert caught.value.run.accepted is False
 
 

@@ -35,13 +35,13 @@ def test_a_hidden_rate_is_reconstructed(hidden, filter):
 
 
 def test_wrong_arguments_raise():
-    with pytest.raises(ValueError, match="decay"):
+    with pytest.raises(ValueError, match=r"\bdecay\b.*\bbandwidth\b"):
         corotate.HiddenRate(BODY)
     with pytest.raises(corotate.CorotateError):
         corotate.HiddenRate([1, 1, 5], decay=1.0).filter(T, np.zeros((len(T), 3)))
     with pytest.raises(ValueError, match=r"\(n, 3\)"):
         corotate.identify(T, np.zeros((len(T), 2)))
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(ValueError, match=rf"\b{T[0]:g} s\b.*\bfinite\b"):
         corotate.identify(T, np.full((len(T), 3), np.nan))
 
 
@@ -61,5 +61,5 @@ def test_the_orbit_law_equals_that_of_a_run(tmp_path, name, body, target, dampin
         applied = run.recording.array(f"{body}/measurement.applied_du_s2")[tick]
         thrust = law.command(own, estimate if target is None else target, applied)
         assert np.array_equal(thrust, run.recording.array(f"{body}/command.thrust_du_s2")[tick]), tick
-    with pytest.raises(ValueError, match="give a radius"):
+    with pytest.raises(ValueError, match=r"\b2\b.*\(r, theta, vr, vtheta\)"):
         law.command(own, [1.0, 2.0])

@@ -58,9 +58,9 @@ def test_a_fleet_s_array_has_an_axis_of_bodies(tmp_path):
 
 
 def test_an_unknown_signal_field_or_file_raises(recording, tmp_path):
-    with pytest.raises(KeyError, match="it has"):
+    with pytest.raises(KeyError, match=r"leader/estimat\b.*leader/estimate\b"):
         recording.array("leader/estimat.omega_rad_s")
-    with pytest.raises(KeyError, match="no field"):
+    with pytest.raises(KeyError, match=r"leader/estimate\b.*\bomega\b.*\bomega_rad_s\b"):
         recording.array("leader/estimate.omega")
     with pytest.raises(corotate.CorotateError):
         corotate.Recording(tmp_path / "none.mcap")

@@ -93,8 +93,8 @@ def test_wrong_arguments_raise_with_their_name(tmp_path):
         ("rigid-pair", {"set": {"duration_s": -1}}, "duration_s"),
         ("rigid-pair", {"clock": "wall"}, "wall"),
         ("rigid-pair", {"roles": {"pilot": print}}, "pilot"),
-        ("rigid-pair", {"clock": "in-process", "roles": {"observer": print}}, "controller"),
-        ({"rig": "rigid-body"}, {}, "missing"),
+        ("rigid-pair", {"clock": "in-process", "roles": {"observer": print}}, "clock='lockstep'"),
+        ({"rig": "rigid-body"}, {}, "duration_s"),
     ]:
         with pytest.raises(ValueError, match=name):
             corotate.run(scenario, out=tmp_path / "mistake", **options)

@@ -3,6 +3,7 @@
 import concurrent.futures
 import multiprocessing
 import os
+import re
 import signal
 
 import distributed
@@ -139,5 +140,5 @@ def test_wrong_campaigns_raise(tmp_path):
         corotate.sweep(CAMPAIGN | {"axis": [{"key": "controller.gian", "values": [1.0]}]}, out=tmp_path)
     (tmp_path / "used").mkdir()
     (tmp_path / "used" / "file").touch()
-    with pytest.raises(corotate.CorotateError, match="used"):
+    with pytest.raises(corotate.CorotateError, match=re.escape(str(tmp_path / "used"))):
         corotate.sweep(CAMPAIGN, out=tmp_path / "used")
