@@ -1,5 +1,5 @@
 //! Measures ticks per second without real time: as processes in lockstep, and in one thread. The lower bounds are the raw hops
-//! and the arithmetic alone.
+//! and the roles alone.
 
 use super::board::Board;
 use super::exchange::{Mechanism, Wake};
@@ -31,8 +31,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     let all = all?;
     // Without a controller no role waits for a command.
     let floor = RoleId::all(&measured).contains(&RoleId::Controller).then_some("two raw hops back to back");
-    let arithmetic = format!("arithmetic alone, {}", bench.scenarios[0].0);
-    let hashed = format!("arithmetic, truths and hashes, {}", bench.scenarios[0].0);
+    let roles_alone = format!("the roles alone, {}", bench.scenarios[0].0);
     let domain = OwnedDomain::create(0)?;
     let mut hop = Pair::open(domain.domain(), false, Mechanism::Iceoryx, Wake::Spin, WORDS)?;
     board.granted(hop.grants());
@@ -49,15 +48,13 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         }
         for (index, (name, scenario)) in all.iter().enumerate() {
             bench.next(&format!("lockstep: in one thread, {name}"))?;
-            let floor = (index == 0).then_some(&*arithmetic);
+            let floor = (index == 0).then_some(&*roles_alone);
             let per_second = ticks_per_second(bench, scenario, limit)?;
             board.add(&format!("in one thread, {name}"), "ticks/s", floor, per_second);
         }
-        for (name, with_hashes) in [(&arithmetic, false), (&hashed, true)] {
-            match measured.rig.arithmetic(&measured, with_hashes) {
-                Some(per_second) => board.add(name, "ticks/s", None, per_second),
-                None => board.remark(format!("{name}: not measured: only that of a leader and one follower is")),
-            }
+        match measured.rig.roles_alone(&measured) {
+            Some(per_second) => board.add(&roles_alone, "ticks/s", None, per_second),
+            None => board.remark(format!("{roles_alone}: not measured: the loop has a fleet, faults or a watchdog")),
         }
     }
     Ok(())

@@ -8,8 +8,8 @@ use crate::bus::Signal;
 use crate::clock::Grid;
 use crate::config::{BodyInfo, Settings};
 use crate::control::WatchBounds;
-use crate::rig::{Command, Estimate, Measurement, Rig, Truth};
-use crate::role::{Body, CommandEvent, Controller, Guard, Observer, Plant};
+use crate::rig::{Estimate, Rig, RigLoopBody, loop_body};
+use crate::role::{Guard, Observer, command_index, cycle};
 use crate::runtime::{RoleId, ports};
 use crate::sample::{Message, Stamp};
 use crate::score::{Score, Scoring};
@@ -20,23 +20,12 @@ use std::time::Instant;
 /// Ticks between two checks of signals and two progress reports.
 pub const TURN_TICKS: u64 = 1024;
 
-/// A body, its latest samples, and the controller that drives it, if any.
-struct Driven<R: Rig> {
-    plant: Plant<R::Body>,
-    measurement: Measurement<R>,
-    truth: Truth<R>,
-    command: Option<Controlled<R>>,
-    hashes: [StateHash; 2],
-}
-
-/// A body's control law with its commands and the guards of both readers.
-struct Controlled<R: Rig> {
-    controller: Controller<R::Law>,
+/// The guards and hashes of a body's samples.
+struct Judge<R: Rig> {
     measurement_guard: R::MeasurementGuard,
     command_guard: R::CommandGuard,
-    /// The commands in flight, indexed by their tick modulo the delay.
-    commands: Vec<Command<R>>,
-    hash: StateHash,
+    /// Of the measurements, the truths and the commands.
+    hashes: [StateHash; 3],
 }
 
 /// Returns true if a run of this scenario may be a direct one.
@@ -57,15 +46,11 @@ pub(crate) fn run_rig<R: Rig>(
     is_plain(scenario).then(|| Run::new(rig, scenario, checkpoints).run(proceed)).flatten()
 }
 
-/// Returns the index of a tick's command, which is also that of the command applied at this tick. Usually needs no division.
-fn command_index(tick: u64, delay_ticks: u64) -> usize {
-    if delay_ticks == 1 { 0 } else { (tick % delay_ticks) as usize }
-}
-
 struct Run<'a, R: Rig> {
     scenario: &'a Settings,
     grid: Grid,
-    bodies: Vec<Driven<R>>,
+    bodies: Vec<RigLoopBody<R>>,
+    judges: Vec<Judge<R>>,
     observer: Observer<R::Estimator>,
     measurement_guard: R::MeasurementGuard,
     estimate: Estimate<R>,
@@ -81,24 +66,19 @@ impl<'a, R: Rig> Run<'a, R> {
             true => StateHash::open(&Ledger::private(StateHash::words(scenario.last_tick)), scenario.last_tick),
             false => StateHash::without_checkpoints(),
         };
-        let body = |(index, info): (usize, &BodyInfo)| Driven {
-            plant: Plant::new(rig.body(index), scenario.actuation(info.driven), scenario.tick_s()),
-            measurement: Measurement::<R>::default(),
-            truth: Truth::<R>::default(),
-            command: info.driven.then(|| Controlled {
-                controller: Controller::new(rig.law(index)),
-                measurement_guard: rig.measurement_guard(index, true),
-                command_guard: rig.command_guard(index),
-                commands: vec![Command::<R>::default(); scenario.actuation_delay_ticks as usize],
-                hash: hash(),
-            }),
-            hashes: [hash(), hash()],
+        let body = |(index, info): (usize, &BodyInfo)| {
+            loop_body(rig, index, info.driven, scenario.actuation(info.driven), scenario.tick_s())
         };
-        let bodies: Vec<Driven<R>> = rig.bodies().iter().enumerate().map(body).collect();
+        let judge = |index| Judge {
+            measurement_guard: rig.measurement_guard(index, true),
+            command_guard: rig.command_guard(index),
+            hashes: [(); 3].map(|()| hash()),
+        };
         Self {
             scenario,
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
-            bodies,
+            bodies: rig.bodies().iter().enumerate().map(body).collect(),
+            judges: (0..rig.bodies().len()).map(judge).collect(),
             observer: Observer::new(rig.estimator(), scenario.tick_s()),
             measurement_guard: rig.measurement_guard(0, false),
             estimate: Estimate::<R>::default(),
@@ -127,49 +107,23 @@ impl<'a, R: Rig> Run<'a, R> {
     /// Runs one tick of all roles. Returns false if a node would have had a choice.
     #[inline]
     fn tick(&mut self, tick: u64) -> bool {
-        let stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
-        let delay = self.scenario.actuation_delay_ticks;
-        for body in &mut self.bodies {
-            let applied = match &mut body.command {
-                Some(controlled) if tick > 0 => {
-                    let (newest, due) = (command_index(tick - 1, delay), command_index(tick, delay));
-                    let expected = if tick < delay { CommandEvent::NotDue } else { CommandEvent::Applied };
-                    controlled.command_guard.accepts(&controlled.commands[newest])
-                        && body.plant.command(tick, Some(&controlled.commands[due])) == expected
-                }
-                _ => body.plant.command(tick, None) == CommandEvent::NotDue,
-            };
-            if !applied {
-                return false;
-            }
-            body.plant.measure(&stamp, &mut body.measurement);
-            body.measurement.stamp_mut().generation = 1;
-            body.plant.truth(&stamp, &mut body.truth);
-            body.truth.stamp_mut().generation = 1;
-            body.plant.advance(1);
-            body.hashes[0].absorb(tick, body.measurement.content());
-            body.hashes[1].absorb(tick, body.truth.content());
-        }
-        let observed = &self.bodies[0].measurement;
-        if !self.measurement_guard.accepts(observed) {
+        let stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), generation: 1, ..Stamp::default() };
+        if !cycle(&stamp, &mut self.observer, &mut self.estimate, &mut self.bodies)
+            || !self.measurement_guard.accepts(&self.bodies[0].measurement)
+            || !self.estimate_guard.accepts(&self.estimate)
+        {
             return false;
         }
-        self.observer.step(observed, &mut self.estimate);
-        (self.estimate.stamp_mut().generation, self.estimate.stamp_mut().sent_ns) = (1, 0);
         self.estimate_hash.absorb(tick, self.estimate.content());
-        if !self.estimate_guard.accepts(&self.estimate) {
-            return false;
-        }
-        for Driven { measurement, command, .. } in &mut self.bodies {
-            let Some(controlled) = command else { continue };
-            if !controlled.measurement_guard.accepts(measurement) {
+        for (body, judge) in self.bodies.iter().zip(&mut self.judges) {
+            judge.hashes[0].absorb(tick, body.measurement.content());
+            judge.hashes[1].absorb(tick, body.truth.content());
+            let Some(control) = &body.control else { continue };
+            let command = &control.commands[command_index(tick, control.commands.len())];
+            if !judge.measurement_guard.accepts(&body.measurement) || !judge.command_guard.accepts(command) {
                 return false;
             }
-            let command = &mut controlled.commands[command_index(tick, delay)];
-            controlled.controller.step(&self.estimate, measurement, command);
-            let stamp = command.stamp_mut();
-            (stamp.generation, stamp.sent_ns) = (1, 0);
-            controlled.hash.absorb(tick, command.content());
+            judge.hashes[2].absorb(tick, command.content());
         }
         let bodies = &self.bodies;
         self.scoring.take(|body| Some(&bodies[body].truth), |_| None, Some(&self.estimate), true);
@@ -218,52 +172,27 @@ impl<'a, R: Rig> Run<'a, R> {
 
     fn checkpoints(&self, name: &str, signal: Signal) -> Checkpoints {
         let index = self.scenario.bodies.iter().position(|body| body.name == name).unwrap_or(0);
-        let body = &self.bodies[index];
-        let hash = match (signal, &body.command) {
-            (Signal::Measurement, _) => &body.hashes[0],
-            (Signal::Estimate, _) => &self.estimate_hash,
-            (Signal::Command, Some(controlled)) => &controlled.hash,
-            _ => &body.hashes[1],
+        let [measurements, truths, commands] = &self.judges[index].hashes;
+        let hash = match signal {
+            Signal::Measurement => measurements,
+            Signal::Estimate => &self.estimate_hash,
+            Signal::Command => commands,
+            _ => truths,
         };
         hash.checkpoints()
     }
 }
 
-/// Measures the mathematics of all roles of a leader and a follower, called one after the other, in ticks per second. Returns
-/// `None` for other rigs. `hashed` adds what every run needs besides: the truths, and the hash of each sample.
-pub(crate) fn arithmetic_alone<R: Rig>(rig: &R, scenario: &Settings, hashed: bool) -> Option<f64> {
-    let [BodyInfo { driven: false, fleet: None, .. }, BodyInfo { driven: true, fleet: None, .. }] = rig.bodies() else {
-        return None;
-    };
-    let tick_s = scenario.tick_s();
-    let (mut leader, mut follower) = (rig.body(0), rig.body(1));
-    let (mut observer, mut controller) = (Observer::new(rig.estimator(), tick_s), Controller::new(rig.law(1)));
-    let mut measured = [Measurement::<R>::default(); 2];
-    let (mut estimate, mut command) = (Estimate::<R>::default(), Command::<R>::default());
-    let (mut truth, mut hashes) = (Truth::<R>::default(), [(); 6].map(|()| StateHash::without_checkpoints()));
-    let began = Instant::now();
-    for tick in 0..=scenario.last_tick {
-        if tick > 0 {
-            black_box(follower.apply(&command));
+/// Measures the roles of a loop called one after the other, without guards, hashes, counters and score, in ticks per second.
+/// Returns `None` for a loop with a fleet.
+pub(crate) fn roles_alone<R: Rig>(rig: &R, scenario: &Settings) -> Option<f64> {
+    is_plain(scenario).then(|| {
+        let Run { mut bodies, mut observer, mut estimate, .. } = Run::new(rig, scenario, false);
+        let began = Instant::now();
+        for tick in 0..=scenario.last_tick {
+            let stamp = Stamp { tick, generation: 1, ..Stamp::default() };
+            black_box(cycle(&stamp, &mut observer, &mut estimate, black_box(&mut bodies)));
         }
-        let bodies = [&mut leader, &mut follower].into_iter().zip(&mut measured).zip(hashes.chunks_exact_mut(2));
-        for ((body, measured), hashes) in bodies {
-            body.measure(0, 0, measured);
-            measured.stamp_mut().tick = tick;
-            if hashed {
-                body.truth(0, &mut truth);
-                hashes[0].absorb(tick, measured.content());
-                hashes[1].absorb(tick, truth.content());
-            }
-            body.flow(tick_s);
-        }
-        observer.step(&measured[0], &mut estimate);
-        controller.step(&estimate, &measured[1], &mut command);
-        if hashed {
-            hashes[4].absorb(tick, estimate.content());
-            hashes[5].absorb(tick, command.content());
-        }
-    }
-    black_box((&command, &hashes));
-    Some((scenario.last_tick + 1) as f64 / began.elapsed().as_secs_f64())
+        (scenario.last_tick + 1) as f64 / began.elapsed().as_secs_f64()
+    })
 }

@@ -4,12 +4,14 @@
 //! state machines run in one thread, in lockstep and in real time, and therefore give the same bits in all three.
 
 mod controller;
+mod cycle;
 mod guard;
 mod observer;
 mod plant;
 mod relation;
 
 pub use controller::{Controller, Law};
+pub use cycle::{LoopBody, LoopControl, command_index, cycle};
 pub use guard::{AcceptAll, Bounds, Guard, MotionCheck, PlausibilityCheck, Refusal, SUSPECT_SAMPLES};
 pub use observer::{Estimator, Observer};
 pub use plant::{Actuation, Body, CommandEvent, Plant, Rearm, SingleBody};

@@ -2,27 +2,21 @@
 //!
 //! It gives the bits of an undisturbed run. Must not repeat the computation of a role.
 
-use crate::rig::{Command, Estimate, Measurement, Rig, Truth};
-use crate::role::{Actuation, Controller, Guard, Observer, Plant, Rearm, SUSPECT_SAMPLES};
+use crate::rig::{Command, Estimate, Rig, RigLoopBody, Truth, loop_body};
+use crate::role::{Actuation, Guard, LoopBody, LoopControl, Observer, Rearm, SUSPECT_SAMPLES, command_index, cycle};
 use crate::sample::{Field, FieldKind, Message, Sample, Stamp};
 use crate::state::{Persist, Words};
 
 /// The loop of a rig's observed body and one driven one, which may be the same.
 pub(super) struct Chain<R: Rig> {
     rig: R,
-    observed: Plant<R::Body>,
-    /// `None` if the observed body is itself driven.
-    driven: Option<Plant<R::Body>>,
+    /// The observed body, then the driven one if it is another.
+    bodies: Vec<RigLoopBody<R>>,
     observer: Observer<R::Estimator>,
-    controller: Controller<R::Law>,
-    measurement: Measurement<R>,
-    own: Measurement<R>,
-    /// The commands in flight and the one that acts, indexed by their tick modulo the delay.
-    commands: Vec<Command<R>>,
-    truths: [Truth<R>; 2],
     estimate: Estimate<R>,
     /// The controlled fields of the truth, and of the estimate.
     controlled: [Vec<&'static Field>; 2],
+    /// The next tick.
     tick: u64,
 }
 
@@ -30,96 +24,68 @@ impl<R: Rig> Chain<R> {
     /// Creates the loop, at its start, of a rig whose last body is the driven one.
     pub fn new(rig: &R, tick_s: f64, delay_ticks: u64) -> Self {
         let last = rig.bodies().len() - 1;
-        let plant = |index: usize| {
+        let body = |index: usize| {
             let driven = rig.bodies()[index].driven;
             // No command is ever missing here.
             let actuation = Actuation { driven, delay_ticks, timeout_ticks: u64::MAX, rearm: Rearm::Auto };
-            Plant::new(rig.body(index), actuation, tick_s)
+            loop_body(rig, index, index == last, actuation, tick_s)
         };
         Self {
             rig: rig.clone(),
-            observed: plant(0),
-            driven: (last > 0).then(|| plant(last)),
+            bodies: (0..=last).map(body).collect(),
             observer: Observer::new(rig.estimator(), tick_s),
-            controller: Controller::new(rig.law(last)),
-            measurement: Default::default(),
-            own: Default::default(),
-            commands: vec![Default::default(); delay_ticks as usize],
-            truths: Default::default(),
             estimate: Default::default(),
             controlled: [controlled::<R, Truth<R>>(), controlled::<R, Estimate<R>>()],
             tick: 0,
         }
     }
 
-    fn command_index(&self, tick: u64) -> usize {
-        (tick % self.commands.len() as u64) as usize
+    /// Runs one tick.
+    pub fn advance(&mut self) {
+        let stamp = Stamp { tick: self.tick, generation: 1, ..Stamp::default() };
+        cycle(&stamp, &mut self.observer, &mut self.estimate, &mut self.bodies);
+        self.tick += 1;
+    }
+
+    /// Returns the driven body with its controller.
+    fn driven(&self) -> &RigLoopBody<R> {
+        &self.bodies[self.bodies.len() - 1]
     }
 
     /// Returns the newest command.
-    fn command(&self) -> &Command<R> {
-        &self.commands[self.command_index(self.tick - 1)]
-    }
-
-    /// Runs one tick: measure, estimate, command, advance the bodies, and apply the command that is due next. With a delay of one
-    /// tick no command is in flight between two ticks.
-    pub fn advance(&mut self) {
-        let (newest, due) = (self.command_index(self.tick), self.command_index(self.tick + 1));
-        let stamp = Stamp { tick: self.tick, generation: 1, ..Stamp::default() };
-        self.observed.measure(&stamp, &mut self.measurement);
-        self.observer.step(&self.measurement, &mut self.estimate);
-        self.observed.truth(&stamp, &mut self.truths[0]);
-        self.tick += 1;
-        match &mut self.driven {
-            Some(driven) => {
-                driven.measure(&stamp, &mut self.own);
-                driven.truth(&stamp, &mut self.truths[1]);
-                self.controller.step(&self.estimate, &self.own, &mut self.commands[newest]);
-                driven.advance(1);
-                driven.command(self.tick, Some(&self.commands[due]));
-                self.observed.advance(1);
-            }
-            None => {
-                self.controller.step(&self.estimate, &self.measurement, &mut self.commands[newest]);
-                self.observed.advance(1);
-                self.observed.command(self.tick, Some(&self.commands[due]));
-            }
-        }
+    fn command(&self) -> Option<&Command<R>> {
+        let commands = &self.driven().control.as_ref()?.commands;
+        Some(&commands[command_index(self.tick - 1, commands.len())])
     }
 
     /// Computes the rig's metrics at the last tick, in the rig's order.
     pub fn score(&self, out: &mut [f64]) {
-        self.rig.score(|index| self.truths.get(index), |_| None, Some(&self.estimate), out);
+        self.rig.score(|index| Some(&self.bodies.get(index)?.truth), |_| None, Some(&self.estimate), out);
     }
 
     /// Returns the first body whose motion has ended, with the reason.
     pub fn loss(&self) -> Option<String> {
-        let losses = self.truths.iter().zip(self.rig.bodies());
-        losses.filter_map(|(truth, body)| Some(format!("{} {}", body.name, self.rig.loss(truth)?))).next()
+        let mut bodies = self.bodies.iter().zip(self.rig.bodies());
+        bodies.find_map(|(body, info)| Some(format!("{} {}", info.name, self.rig.loss(&body.truth)?)))
     }
 
     /// Writes the controlled numbers of the driven body's truth and of the estimate at the last tick.
     pub fn output(&self, out: &mut Vec<f64>) {
         out.clear();
-        self.controlled[0].iter().for_each(|field| out.extend(values(self.truth(), field)));
+        self.controlled[0].iter().for_each(|field| out.extend(values(&self.driven().truth, field)));
         self.controlled[1].iter().for_each(|field| out.extend(values(&self.estimate, field)));
     }
 
     /// Writes the controlled numbers of the observed body's truth.
     pub fn observed(&self, out: &mut Vec<f64>) {
         out.clear();
-        self.controlled[0].iter().for_each(|field| out.extend(values(&self.truths[0], field)));
+        self.controlled[0].iter().for_each(|field| out.extend(values(&self.bodies[0].truth, field)));
     }
 
     /// Returns the driven body's coordinate that the loop does not control.
     pub fn free(&self) -> f64 {
         let field = numbers::<Truth<R>>().find(|field| R::FREE == Some(field.name));
-        field.and_then(|field| values(self.truth(), field).next()).unwrap_or(0.0)
-    }
-
-    /// Returns the driven body's truth.
-    fn truth(&self) -> &Truth<R> {
-        &self.truths[usize::from(self.driven.is_some())]
+        field.and_then(|field| values(&self.driven().truth, field).next()).unwrap_or(0.0)
     }
 
     /// Returns the status bits of the estimate at the last tick.
@@ -130,16 +96,16 @@ impl<R: Rig> Chain<R> {
 
     /// Passes the state of the loop, without that of the motion to follow.
     fn state<W: Words>(&mut self, visitor: &mut W) {
-        match &mut self.driven {
-            Some(driven) => driven.persist(visitor),
-            None => self.observed.persist(visitor),
-        }
+        let last = self.bodies.len() - 1;
+        let LoopBody { plant, control, .. } = &mut self.bodies[last];
+        plant.persist(visitor);
         self.observer.persist(visitor);
-        self.controller.persist(visitor);
+        let Some(LoopControl { controller, commands }) = control else { return };
+        controller.persist(visitor);
         // The plant holds the command that acts.
-        let (tick, count) = (self.tick, self.commands.len() as u64);
-        for command in (1..count).map(|after| ((tick + after) % count) as usize) {
-            let words = self.commands[command].words_mut();
+        for tick in self.tick + 1..self.tick + commands.len() as u64 {
+            let delay_ticks = commands.len();
+            let words = commands[command_index(tick, delay_ticks)].words_mut();
             for field in numbers::<Command<R>>() {
                 for bits in &mut words[field.offset / 8..][..field.count] {
                     let mut number = f64::from_bits(*bits);
@@ -189,12 +155,11 @@ impl<R: Rig> Guards<R> {
     /// Judges the samples of the last tick. Returns the name of one that was refused more than [`SUSPECT_SAMPLES`] times in a row:
     /// a guard doubts a correct sample for no longer than that.
     pub fn refuse(&mut self, chain: &Chain<R>) -> Option<&'static str> {
-        let own = if chain.driven.is_some() { &chain.own } else { &chain.measurement };
         let accepted = [
-            ("the measurement of the observed body", self.measurement.accepts(&chain.measurement)),
+            ("the measurement of the observed body", self.measurement.accepts(&chain.bodies[0].measurement)),
             ("the estimate", self.estimate.accepts(&chain.estimate)),
-            ("the measurement of the driven body", self.own.accepts(own)),
-            ("the command", self.command.accepts(chain.command())),
+            ("the measurement of the driven body", self.own.accepts(&chain.driven().measurement)),
+            ("the command", chain.command().is_none_or(|command| self.command.accepts(command))),
         ];
         let mut counted = self.refused.iter_mut().zip(accepted);
         counted.find_map(|(refused, (name, accepted))| {

@@ -5,7 +5,7 @@
 use super::fleet::Fleet;
 use super::pictures::{Picture, graphs};
 use crate::config::{BodyInfo, Checks, ConfigError, Document};
-use crate::role::{Body, Estimator, Guard, Law, SingleBody};
+use crate::role::{Actuation, Body, Controller, Estimator, Guard, Law, LoopBody, LoopControl, Plant, SingleBody};
 use crate::sample::FleetSample;
 use crate::state::Persist;
 use serde::{Deserialize, Serialize};
@@ -18,6 +18,18 @@ pub type Measurement<R> = <<R as Rig>::Body as Body>::Measurement;
 pub type Estimate<R> = <<R as Rig>::Estimator as Estimator>::Estimate;
 /// The input of a rig's actuators.
 pub type Command<R> = <<R as Rig>::Body as Body>::Command;
+
+/// A body of a rig's loop in one thread.
+pub type RigLoopBody<R> = LoopBody<<R as Rig>::Body, <R as Rig>::Law, Vec<Command<R>>>;
+
+/// Creates a body of a loop in one thread, at its initial state; `controlled` adds its controller.
+pub fn loop_body<R: Rig>(rig: &R, index: usize, controlled: bool, actuation: Actuation, tick_s: f64) -> RigLoopBody<R> {
+    let control = controlled.then(|| LoopControl {
+        controller: Controller::new(rig.law(index)),
+        commands: vec![Command::<R>::default(); actuation.delay_ticks as usize],
+    });
+    LoopBody::new(Plant::new(rig.body(index), actuation, tick_s), control)
+}
 
 /// The full state of a rig's fleet.
 pub type FleetTruth<R> = FleetSample<<<R as Rig>::Fleet as Fleet<Estimate<R>>>::Truth>;

@@ -5,7 +5,7 @@
 use crate::analysis::{self, Claim};
 use crate::bus::{AnyBus, BusError};
 use crate::config::{BodyInfo, Settings, role_names};
-use crate::direct::{self, arithmetic_alone};
+use crate::direct;
 use crate::rig::{CertificateReport, Figure, Picture, Rig, WordView};
 use crate::runtime::{ReadyNode, RoleImpl, build_rig};
 use crate::score::{Score, Scorer, score_rig};
@@ -56,8 +56,8 @@ pub trait AnyRig: WordView + Any + Send + Sync {
         checkpoints: bool,
         proceed: &mut dyn FnMut(u64, f64) -> bool,
     ) -> Option<(Vec<RoleReport>, Score)>;
-    /// Returns the ticks per second of the roles' mathematics alone; `None` unless the rig is a leader with one follower.
-    fn arithmetic(&self, settings: &Settings, hashed: bool) -> Option<f64>;
+    /// Returns the ticks per second of the roles without guards, hashes, counters and score; `None` for a loop with a fleet.
+    fn roles_alone(&self, settings: &Settings) -> Option<f64>;
 }
 
 impl<R: Rig> AnyRig for R {
@@ -126,8 +126,8 @@ impl<R: Rig> AnyRig for R {
         direct::run_rig(self, settings, checkpoints, proceed)
     }
 
-    fn arithmetic(&self, settings: &Settings, hashed: bool) -> Option<f64> {
-        arithmetic_alone(self, settings, hashed)
+    fn roles_alone(&self, settings: &Settings) -> Option<f64> {
+        direct::roles_alone(self, settings)
     }
 }
 
