@@ -3,6 +3,7 @@
 //! Must not wait or decide when it runs; a driver does.
 
 mod bridge;
+mod channel;
 mod context;
 mod contract;
 mod controller;

@@ -1,15 +1,14 @@
 //! A controller on a bus: reads the estimate and the measurement of every driven body, sends a command to each.
 
+use super::channel::{AnyChannel, Channel, Channels, Stages};
 use super::context::{LOOK_NS, NodeContext};
 use super::contract::{Node, Poll, RunCondition};
-use super::missed::MissedTicks;
 use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
 use super::ports::driven;
-use crate::bus::{Bus, BusError, Carried, Signal};
+use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::control::Watchdog;
 use crate::rig::{BodyInfo, Command, Estimate, Fleet, FleetCommand, Rig, Watched};
-use crate::role::{Controller, Guard, Law};
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::error::NodeError;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
@@ -18,178 +17,13 @@ use crate::runtime::sample_source::{Progress, SampleSource};
 use crate::sample::Message;
 use crate::serial::LineCounters;
 use crate::state::{Persist, Words};
-use crate::telemetry::{Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
-
-/// The channel of a single driven body.
-type Single<R, B> = Channel<<R as Rig>::Law, <R as Rig>::MeasurementGuard, B>;
-/// The channel of a fleet.
-type Many<R, B> = Channel<
-    <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Law,
-    <<R as Rig>::Fleet as Fleet<Estimate<R>>>::MeasurementGuard,
-    B,
->;
-
-/// The controller's links to one driven body or fleet.
-struct Channel<L: Law<Measurement: Carried, Command: Carried>, G, B: Bus> {
-    /// The body's index.
-    body: usize,
-    controller: Controller<L>,
-    measurement: Input<B, L::Measurement, G>,
-    command: Output<B, L::Command>,
-    /// True while the measurement of the current tick is available and a command will be sent.
-    ready: bool,
-    /// Start of the current command's computation, and its sending, ns; 0 if no command was sent.
-    began_ns: u64,
-    sent_ns: u64,
-    missed: MissedTicks,
-}
-
-impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B: Bus> Channel<L, G, B> {
-    fn open(
-        index: usize,
-        (body, command): (&BodyInfo, Output<B, L::Command>),
-        law: L,
-        guard: G,
-        context: &NodeContext<'_, B>,
-    ) -> Result<Self, BusError> {
-        let measurement = context.input(body, Signal::Measurement, guard)?;
-        let controller = Controller::new(law);
-        let missed = MissedTicks::default();
-        Ok(Self { body: index, controller, measurement, command, ready: false, began_ns: 0, sent_ns: 0, missed })
-    }
-
-    /// Looks for the measurement of a tick; returns true once it has arrived or is known to be missing.
-    #[inline]
-    fn gather(&mut self, tick: u64) -> Result<bool, NodeError> {
-        let found = self.measurement.seek(tick)?;
-        self.ready = found == Seek::Found;
-        Ok(found != Seek::NotYet)
-    }
-
-    /// Returns the body's index while its measurement of this tick may still arrive.
-    #[inline]
-    fn late(&self, tick: u64) -> Option<usize> {
-        (!self.measurement.knows(tick)).then_some(self.body)
-    }
-
-    /// Returns the measurement of the current tick as words.
-    fn words(&self) -> Option<&[u64]> {
-        self.measurement.sample().filter(|_| self.ready).map(Message::words)
-    }
-
-    /// Passes over a tick without command.
-    fn pass_over(&mut self, tick: u64) -> Result<(), NodeError> {
-        // Consumes the unused measurement, which must not fill the link.
-        self.measurement.seek(tick)?;
-        self.ready = false;
-        self.command.stage_marker(tick);
-        Ok(())
-    }
-
-    /// Stages the command of this tick, begun at `began_ns`, unless the measurement is missing or the watchdog is
-    /// latched. Returns the start of the next command's computation; sets `starved` if the measurement is missing.
-    #[inline]
-    fn execute(
-        &mut self,
-        estimate: &L::Estimate,
-        silent: bool,
-        (clock, began_ns): (Clock, u64),
-        starved: &mut bool,
-        computed: Option<(&SampleSource, usize)>,
-    ) -> Result<u64, NodeError> {
-        *starved |= !self.ready;
-        if silent {
-            // The watchdog suppresses the command: it does not count as missed.
-            let _ = self.missed.before(estimate.stamp().tick);
-        }
-        self.ready &= !silent && computed.is_none_or(|(source, index)| source.has(index));
-        let Some(measurement) = self.measurement.sample().filter(|_| self.ready) else {
-            self.command.stage_marker(estimate.stamp().tick);
-            return Ok(began_ns);
-        };
-        let (controller, sent_ns) = (&mut self.controller, &mut self.sent_ns);
-        self.command.stage(|sample| {
-            controller.step(estimate, measurement, sample);
-            if let Some((source, index)) = computed {
-                source.write(index, sample.words_mut());
-            }
-            *sent_ns = clock.now_ns();
-            sample.stamp_mut().sent_ns = *sent_ns;
-        })?;
-        self.began_ns = began_ns;
-        Ok(self.sent_ns)
-    }
-
-    /// Completes a sent command.
-    #[inline]
-    fn finish_tick(&mut self, stages: Option<&mut Stages>) -> Result<(), NodeError> {
-        if let Some(stages) = stages.filter(|_| self.ready) {
-            let missed = self.missed.before(stages.tick);
-            stages.enter_missed(missed, self.began_ns);
-            stages.step.record(self.began_ns, self.sent_ns);
-            stages.age.record(stages.origin_ns, self.sent_ns);
-        }
-        Ok(self.command.finish()?)
-    }
-
-    /// Records the missed commands before `tick` at the end of the run.
-    fn enter_rest(&mut self, tick: u64, stages: &mut Stages) {
-        let (missed, until_ns) = self.missed.rest(tick);
-        stages.enter_missed(missed, until_ns);
-    }
-
-    fn state<W: Words>(&mut self, words: &mut W)
-    where
-        L: Persist,
-        G: Persist,
-    {
-        self.controller.persist(words);
-        self.measurement.persist(words);
-        self.command.persist_late(words);
-    }
-
-    fn warm_up(&mut self) -> Result<(), NodeError> {
-        self.measurement.warm_up()?;
-        Ok(self.command.warm_up()?)
-    }
-
-    fn refresh(&mut self) -> Result<(), NodeError> {
-        self.measurement.refresh();
-        Ok(self.command.refresh()?)
-    }
-}
-
-/// The latency distributions, and the tick that is recorded.
-#[derive(Default)]
-struct Stages {
-    tick: u64,
-    /// Origin and sending of the current estimate, and arrival of the last input, ns.
-    origin_ns: u64,
-    estimate_sent_ns: u64,
-    received_ns: u64,
-    missed: MissedTicks,
-    hop: Latency,
-    step: Latency,
-    age: Latency,
-}
-
-impl Stages {
-    /// Records missed commands from their due instants.
-    #[inline]
-    fn enter_missed(&mut self, due_ns: impl Iterator<Item = u64>, until_ns: u64) {
-        for due_ns in due_ns {
-            self.step.record_missed(due_ns, until_ns);
-            self.age.record_missed(due_ns, until_ns);
-        }
-    }
-}
+use crate::telemetry::{Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
 
 /// A controller with its links and counters.
 pub struct ControllerNode<R: Rig, B: Bus> {
     rig: R,
     estimate: Input<B, Estimate<R>, R::EstimateGuard>,
-    channels: Vec<Single<R, B>>,
-    fleets: Vec<Many<R, B>>,
+    channels: Channels<R, B>,
     clock: Clock,
     counters: TickCounters,
     watchdog: Watchdog,
@@ -214,7 +48,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
             Channel::open(index, (body, command), rig.law(index), rig.measurement_guard(index, true), context)
         };
-        let channels = bodies(false).zip(commands).map(channel).collect::<Result<_, BusError>>()?;
+        let single = bodies(false).zip(commands).map(channel).collect::<Result<_, BusError>>()?;
         let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
             let fleet = rig.fleet(index)?;
             Some(Channel::open(index, (body, command), fleet.law(), fleet.measurement_guard(), context))
@@ -223,8 +57,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         Ok(Self {
             rig: rig.clone(),
             estimate,
-            channels,
-            fleets,
+            channels: Channels { single, fleets },
             clock: context.clock,
             counters: TickCounters::default(),
             watchdog: Watchdog::new(context.scenario.watch),
@@ -267,11 +100,8 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     #[inline]
     fn gather_measurements(&mut self, tick: u64) -> Result<bool, NodeError> {
         let mut complete = true;
-        for channel in &mut self.channels {
+        for channel in self.channels.iter_mut() {
             complete &= channel.gather(tick)?;
-        }
-        for fleet in &mut self.fleets {
-            complete &= fleet.gather(tick)?;
         }
         Ok(complete)
     }
@@ -279,12 +109,9 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     /// Passes the measurements of a tick to a device that also computes the estimate, once each has arrived or is known
     /// to be missing.
     fn offer(&mut self, tick: u64, overdue: bool) -> Result<(), NodeError> {
-        let mut complete = true;
-        for channel in &mut self.channels {
-            complete &= channel.gather(tick)?;
-        }
+        let complete = self.gather_measurements(tick)?;
         if let Some(source) = self.source.as_mut().filter(|_| complete || overdue) {
-            source.offer(std::iter::once(None).chain(self.channels.iter().map(Channel::words)));
+            source.offer(std::iter::once(None).chain(self.channels.iter().map(AnyChannel::words)));
         }
         Ok(())
     }
@@ -292,12 +119,10 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     /// Reads one channel, the next one at each call.
     #[inline]
     fn look_ahead(&mut self) -> Result<(), NodeError> {
-        let (single, all) = (self.channels.len(), self.channels.len() + self.fleets.len());
+        let all = self.channels.iter().count();
         self.look = if self.look + 1 < all { self.look + 1 } else { 0 };
-        if let Some(channel) = self.channels.get_mut(self.look) {
-            channel.measurement.seek(u64::MAX)?;
-        } else if let Some(fleet) = self.fleets.get_mut(self.look - single) {
-            fleet.measurement.seek(u64::MAX)?;
+        if let Some(channel) = self.channels.iter_mut().nth(self.look) {
+            channel.gather(u64::MAX)?;
         }
         Ok(())
     }
@@ -325,7 +150,6 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     /// Passes over a tick on every channel, with no-sample markers where readers wait.
     fn send_nothing(&mut self, tick: u64) -> Result<(), NodeError> {
         self.channels.iter_mut().try_for_each(|channel| channel.pass_over(tick))?;
-        self.fleets.iter_mut().try_for_each(|fleet| fleet.pass_over(tick))?;
         commit(self);
         self.dispatch()?;
         self.finish_commands()
@@ -334,13 +158,11 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     /// Sends the staged commands.
     #[inline]
     fn dispatch(&mut self) -> Result<(), NodeError> {
-        self.channels.iter_mut().try_for_each(|channel| channel.command.dispatch())?;
-        Ok(self.fleets.iter_mut().try_for_each(|fleet| fleet.command.dispatch())?)
+        self.channels.iter_mut().try_for_each(AnyChannel::dispatch)
     }
 
     fn finish_commands(&mut self) -> Result<(), NodeError> {
-        self.channels.iter_mut().try_for_each(|channel| channel.command.finish())?;
-        Ok(self.fleets.iter_mut().try_for_each(|fleet| fleet.command.finish())?)
+        self.channels.iter_mut().try_for_each(AnyChannel::finish_command)
     }
 
     /// Passes the estimate's monitored quantities to the watchdog.
@@ -383,10 +205,8 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             return self.miss(stamp.tick);
         }
         if let Some(source) = &mut self.source {
-            let singles = self.channels.iter().map(Channel::words);
-            let fleets = self.fleets.iter().map(Channel::words);
             let estimate = std::iter::once(self.estimate.sample().map(Message::words));
-            match source.tick(stamp.tick, estimate.chain(singles).chain(fleets))? {
+            match source.tick(stamp.tick, estimate.chain(self.channels.iter().map(AnyChannel::words)))? {
                 Progress::Done => {
                     began_ns = source.asked_ns(stamp.tick).unwrap_or(began_ns);
                     // A device that also computes the estimate was asked before the estimate was sent.
@@ -411,15 +231,16 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let silent = self.watchdog.latched_at().is_some();
         let clock = self.clock;
         let mut starved = false;
+        let single = self.channels.single.len();
         for (index, channel) in self.channels.iter_mut().enumerate() {
-            let computed = self.source.as_ref().map(|source| (source, index));
+            // A fleet has no device.
+            let computed = self.source.as_ref().filter(|_| index < single).map(|source| (source, index));
             began_ns = channel.execute(estimate, silent, (clock, began_ns), &mut starved, computed)?;
-            if self.watchdog.active() && channel.ready {
+        }
+        if self.watchdog.active() {
+            for channel in self.channels.single.iter().filter(|channel| channel.ready) {
                 Self::watch_command(&mut self.watchdog, stamp.tick, channel.command.last());
             }
-        }
-        for fleet in &mut self.fleets {
-            began_ns = fleet.execute(estimate, silent, (clock, began_ns), &mut starved, None)?;
         }
         (self.stages.origin_ns, self.stages.estimate_sent_ns) = (stamp.origin_ns, stamp.sent_ns);
         self.stages.tick = stamp.tick;
@@ -448,8 +269,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
             self.counters.restarted_without_state();
         }
         self.estimate.expect_repeats();
-        self.channels.iter_mut().for_each(|channel| channel.measurement.expect_repeats());
-        self.fleets.iter_mut().for_each(|fleet| fleet.measurement.expect_repeats());
+        self.channels.iter_mut().for_each(AnyChannel::expect_repeats);
         Ok(())
     }
 
@@ -457,15 +277,12 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         if self.clock == Clock::Monotonic {
             self.estimate.expect(AcceptedTicks::Due(grid));
             self.source.iter_mut().for_each(|source| source.start(grid));
-            self.channels.iter_mut().for_each(|channel| channel.measurement.expect(AcceptedTicks::Due(grid)));
-            self.fleets.iter_mut().for_each(|fleet| fleet.measurement.expect(AcceptedTicks::Due(grid)));
         }
         self.dispatch()?;
         self.finish_commands()?;
         let next = self.counters.next();
         self.stages.missed.start(self.clock, grid, next);
-        self.channels.iter_mut().for_each(|channel| channel.missed.start(self.clock, grid, next));
-        self.fleets.iter_mut().for_each(|fleet| fleet.missed.start(self.clock, grid, next));
+        self.channels.iter_mut().for_each(|channel| channel.start(self.clock, grid, next));
         self.skip_to(first_tick);
         Ok(())
     }
@@ -488,8 +305,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     fn awaits(&self) -> Option<RoleId> {
         let next = self.counters.next();
-        let single = || self.channels.iter().find_map(|channel| channel.late(next));
-        let late = single().or_else(|| self.fleets.iter().find_map(|fleet| fleet.late(next)));
+        let late = self.channels.iter().find_map(|channel| channel.late(next));
         Some(late.map_or(RoleId::Observer, RoleId::Plant))
     }
 
@@ -502,9 +318,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         } else if self.lacks_estimate() {
             self.estimate.sleep(until_ns)?;
         } else if let Some(late) = self.channels.iter_mut().find(|channel| channel.late(tick).is_some()) {
-            late.measurement.sleep(until_ns)?;
-        } else if let Some(late) = self.fleets.iter_mut().find(|fleet| fleet.late(tick).is_some()) {
-            late.measurement.sleep(until_ns)?;
+            late.sleep(until_ns)?;
         } else {
             return Ok(false);
         }
@@ -518,13 +332,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
             missed.before(*tick).for_each(|due_ns| hop.record_missed(due_ns, *received_ns));
             hop.record(*estimate_sent_ns, *received_ns);
         }
-        for channel in &mut self.channels {
-            channel.finish_tick(stages.as_deref_mut())?;
-        }
-        for fleet in &mut self.fleets {
-            fleet.finish_tick(stages.as_deref_mut())?;
-        }
-        Ok(())
+        self.channels.iter_mut().try_for_each(|channel| channel.finish_tick(stages.as_deref_mut()))
     }
 
     fn finish(&mut self) -> Result<(), NodeError> {
@@ -533,7 +341,6 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         let (missed, until_ns) = stages.missed.rest(next);
         missed.for_each(|due_ns| stages.hop.record_missed(due_ns, until_ns));
         self.channels.iter_mut().for_each(|channel| channel.enter_rest(next, stages));
-        self.fleets.iter_mut().for_each(|fleet| fleet.enter_rest(next, stages));
         commit_last(self);
         Ok(())
     }
@@ -544,14 +351,12 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     fn warm_up(&mut self) -> Result<(), NodeError> {
         self.estimate.warm_up()?;
-        self.channels.iter_mut().try_for_each(Channel::warm_up)?;
-        self.fleets.iter_mut().try_for_each(Channel::warm_up)
+        self.channels.iter_mut().try_for_each(AnyChannel::warm_up)
     }
 
     fn refresh(&mut self) -> Result<(), NodeError> {
         self.estimate.refresh();
-        self.channels.iter_mut().try_for_each(Channel::refresh)?;
-        self.fleets.iter_mut().try_for_each(Channel::refresh)
+        self.channels.iter_mut().try_for_each(AnyChannel::refresh)
     }
 
     fn state_words(&mut self) -> usize {
@@ -587,18 +392,18 @@ impl<R: Rig, B: Bus> Persistent for ControllerNode<R, B> {
     #[inline]
     fn counters<W: Words>(&mut self, words: &mut W) {
         self.counters.persist(words);
-        self.channels.iter_mut().for_each(|channel| channel.command.persist(words));
-        self.fleets.iter_mut().for_each(|fleet| fleet.command.persist(words));
+        self.channels.single.iter_mut().for_each(|channel| channel.command.persist(words));
+        self.channels.fleets.iter_mut().for_each(|fleet| fleet.command.persist(words));
         self.estimate.counters().persist(words);
-        self.channels.iter_mut().for_each(|channel| channel.measurement.counters().persist(words));
-        self.fleets.iter_mut().for_each(|fleet| fleet.measurement.counters().persist(words));
+        self.channels.single.iter_mut().for_each(|channel| channel.measurement.counters().persist(words));
+        self.channels.fleets.iter_mut().for_each(|fleet| fleet.measurement.counters().persist(words));
         self.watchdog.persist(words);
     }
 
     #[inline]
     fn state<W: Words>(&mut self, words: &mut W) {
         self.estimate.persist(words);
-        self.channels.iter_mut().for_each(|channel| channel.state(words));
-        self.fleets.iter_mut().for_each(|fleet| fleet.state(words));
+        self.channels.single.iter_mut().for_each(|channel| channel.state(words));
+        self.channels.fleets.iter_mut().for_each(|fleet| fleet.state(words));
     }
 }

@@ -1,0 +1,258 @@
+//! The controller's links to a driven body or fleet.
+
+use super::context::NodeContext;
+use super::missed::MissedTicks;
+use crate::bus::{Bus, BusError, Carried, Signal};
+use crate::clock::{Clock, Grid};
+use crate::rig::{BodyInfo, Estimate, Fleet, Rig};
+use crate::role::{Controller, Guard, Law};
+use crate::runtime::error::NodeError;
+use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
+use crate::runtime::sample_source::SampleSource;
+use crate::sample::Message;
+use crate::state::{Persist, Words};
+use crate::telemetry::Latency;
+
+/// The channel of a single driven body.
+pub type Single<R, B> = Channel<<R as Rig>::Law, <R as Rig>::MeasurementGuard, B>;
+/// The channel of a fleet.
+pub type Many<R, B> = Channel<
+    <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Law,
+    <<R as Rig>::Fleet as Fleet<Estimate<R>>>::MeasurementGuard,
+    B,
+>;
+
+/// The channels of a controller: those of the single bodies, then those of the fleets.
+pub struct Channels<R: Rig, B: Bus> {
+    pub single: Vec<Single<R, B>>,
+    pub fleets: Vec<Many<R, B>>,
+}
+
+impl<R: Rig, B: Bus> Channels<R, B> {
+    #[inline]
+    pub fn iter(&self) -> impl Iterator<Item = &dyn AnyChannel<Estimate<R>>> {
+        let single = self.single.iter().map(|channel| channel as &dyn AnyChannel<_>);
+        single.chain(self.fleets.iter().map(|channel| channel as &dyn AnyChannel<_>))
+    }
+
+    #[inline]
+    pub fn iter_mut(&mut self) -> impl Iterator<Item = &mut dyn AnyChannel<Estimate<R>>> {
+        let single = self.single.iter_mut().map(|channel| channel as &mut dyn AnyChannel<_>);
+        single.chain(self.fleets.iter_mut().map(|channel| channel as &mut dyn AnyChannel<_>))
+    }
+}
+
+/// The controller's links to one driven body or fleet.
+pub struct Channel<L: Law<Measurement: Carried, Command: Carried>, G, B: Bus> {
+    /// The body's index.
+    body: usize,
+    controller: Controller<L>,
+    pub measurement: Input<B, L::Measurement, G>,
+    pub command: Output<B, L::Command>,
+    /// True while the measurement of the current tick is available and a command will be sent.
+    pub ready: bool,
+    /// Start of the current command's computation, and its sending, ns; 0 if no command was sent.
+    began_ns: u64,
+    sent_ns: u64,
+    missed: MissedTicks,
+}
+
+impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B: Bus> Channel<L, G, B> {
+    pub fn open(
+        index: usize,
+        (body, command): (&BodyInfo, Output<B, L::Command>),
+        law: L,
+        guard: G,
+        context: &NodeContext<'_, B>,
+    ) -> Result<Self, BusError> {
+        let measurement = context.input(body, Signal::Measurement, guard)?;
+        let controller = Controller::new(law);
+        let missed = MissedTicks::default();
+        Ok(Self { body: index, controller, measurement, command, ready: false, began_ns: 0, sent_ns: 0, missed })
+    }
+
+    pub fn state<W: Words>(&mut self, words: &mut W)
+    where
+        L: Persist,
+        G: Persist,
+    {
+        self.controller.persist(words);
+        self.measurement.persist(words);
+        self.command.persist_late(words);
+    }
+}
+
+/// What a controller does with every channel.
+pub trait AnyChannel<E> {
+    /// Accepts the samples that a predecessor has already used.
+    fn expect_repeats(&mut self);
+    /// Sets the time grid and the first tick that counts.
+    fn start(&mut self, clock: Clock, grid: Grid, next: u64);
+    /// Looks for the measurement of a tick; returns true once it has arrived or is known to be missing.
+    fn gather(&mut self, tick: u64) -> Result<bool, NodeError>;
+    /// Returns the body's index while its measurement of this tick may still arrive.
+    fn late(&self, tick: u64) -> Option<usize>;
+    /// Returns the measurement of the current tick as words.
+    fn words(&self) -> Option<&[u64]>;
+    /// Passes over a tick without command.
+    fn pass_over(&mut self, tick: u64) -> Result<(), NodeError>;
+    /// Stages the command of this tick, begun at `began_ns`, unless the measurement is missing or the watchdog is
+    /// latched. Returns the start of the next command's computation; sets `starved` if the measurement is missing.
+    fn execute(
+        &mut self,
+        estimate: &E,
+        silent: bool,
+        began: (Clock, u64),
+        starved: &mut bool,
+        computed: Option<(&SampleSource, usize)>,
+    ) -> Result<u64, NodeError>;
+    /// Sends the staged command.
+    fn dispatch(&mut self) -> Result<(), NodeError>;
+    /// Prepares the next command.
+    fn finish_command(&mut self) -> Result<(), NodeError>;
+    /// Waits for the next measurement.
+    fn sleep(&mut self, until_ns: u64) -> Result<(), NodeError>;
+    /// Records the latencies of a sent command, and prepares the next one.
+    fn finish_tick(&mut self, stages: Option<&mut Stages>) -> Result<(), NodeError>;
+    /// Records the missed commands before `tick` at the end of the run.
+    fn enter_rest(&mut self, tick: u64, stages: &mut Stages);
+    fn warm_up(&mut self) -> Result<(), NodeError>;
+    fn refresh(&mut self) -> Result<(), NodeError>;
+}
+
+impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B: Bus> AnyChannel<L::Estimate>
+    for Channel<L, G, B>
+{
+    fn expect_repeats(&mut self) {
+        self.measurement.expect_repeats();
+    }
+
+    fn start(&mut self, clock: Clock, grid: Grid, next: u64) {
+        if clock == Clock::Monotonic {
+            self.measurement.expect(AcceptedTicks::Due(grid));
+        }
+        self.missed.start(clock, grid, next);
+    }
+
+    #[inline]
+    fn dispatch(&mut self) -> Result<(), NodeError> {
+        Ok(self.command.dispatch()?)
+    }
+
+    #[inline]
+    fn finish_command(&mut self) -> Result<(), NodeError> {
+        Ok(self.command.finish()?)
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<(), NodeError> {
+        self.measurement.sleep(until_ns)?;
+        Ok(())
+    }
+
+    #[inline]
+    fn gather(&mut self, tick: u64) -> Result<bool, NodeError> {
+        let found = self.measurement.seek(tick)?;
+        self.ready = found == Seek::Found;
+        Ok(found != Seek::NotYet)
+    }
+
+    #[inline]
+    fn late(&self, tick: u64) -> Option<usize> {
+        (!self.measurement.knows(tick)).then_some(self.body)
+    }
+
+    fn words(&self) -> Option<&[u64]> {
+        self.measurement.sample().filter(|_| self.ready).map(Message::words)
+    }
+
+    fn pass_over(&mut self, tick: u64) -> Result<(), NodeError> {
+        // Consumes the unused measurement, which must not fill the link.
+        self.measurement.seek(tick)?;
+        self.ready = false;
+        self.command.stage_marker(tick);
+        Ok(())
+    }
+
+    #[inline]
+    fn execute(
+        &mut self,
+        estimate: &L::Estimate,
+        silent: bool,
+        (clock, began_ns): (Clock, u64),
+        starved: &mut bool,
+        computed: Option<(&SampleSource, usize)>,
+    ) -> Result<u64, NodeError> {
+        *starved |= !self.ready;
+        if silent {
+            // The watchdog suppresses the command: it does not count as missed.
+            let _ = self.missed.before(estimate.stamp().tick);
+        }
+        self.ready &= !silent && computed.is_none_or(|(source, index)| source.has(index));
+        let Some(measurement) = self.measurement.sample().filter(|_| self.ready) else {
+            self.command.stage_marker(estimate.stamp().tick);
+            return Ok(began_ns);
+        };
+        let (controller, sent_ns) = (&mut self.controller, &mut self.sent_ns);
+        self.command.stage(|sample| {
+            controller.step(estimate, measurement, sample);
+            if let Some((source, index)) = computed {
+                source.write(index, sample.words_mut());
+            }
+            *sent_ns = clock.now_ns();
+            sample.stamp_mut().sent_ns = *sent_ns;
+        })?;
+        self.began_ns = began_ns;
+        Ok(self.sent_ns)
+    }
+
+    #[inline]
+    fn finish_tick(&mut self, stages: Option<&mut Stages>) -> Result<(), NodeError> {
+        if let Some(stages) = stages.filter(|_| self.ready) {
+            let missed = self.missed.before(stages.tick);
+            stages.enter_missed(missed, self.began_ns);
+            stages.step.record(self.began_ns, self.sent_ns);
+            stages.age.record(stages.origin_ns, self.sent_ns);
+        }
+        self.finish_command()
+    }
+
+    fn enter_rest(&mut self, tick: u64, stages: &mut Stages) {
+        let (missed, until_ns) = self.missed.rest(tick);
+        stages.enter_missed(missed, until_ns);
+    }
+
+    fn warm_up(&mut self) -> Result<(), NodeError> {
+        self.measurement.warm_up()?;
+        Ok(self.command.warm_up()?)
+    }
+
+    fn refresh(&mut self) -> Result<(), NodeError> {
+        self.measurement.refresh();
+        Ok(self.command.refresh()?)
+    }
+}
+
+/// The latency distributions, and the tick that is recorded.
+#[derive(Default)]
+pub struct Stages {
+    pub tick: u64,
+    /// Origin and sending of the current estimate, and arrival of the last input, ns.
+    pub origin_ns: u64,
+    pub estimate_sent_ns: u64,
+    pub received_ns: u64,
+    pub missed: MissedTicks,
+    pub hop: Latency,
+    pub step: Latency,
+    pub age: Latency,
+}
+
+impl Stages {
+    /// Records missed commands from their due instants.
+    #[inline]
+    pub fn enter_missed(&mut self, due_ns: impl Iterator<Item = u64>, until_ns: u64) {
+        for due_ns in due_ns {
+            self.step.record_missed(due_ns, until_ns);
+            self.age.record_missed(due_ns, until_ns);
+        }
+    }
+}
