@@ -82,7 +82,7 @@ pub enum HurwitzError<const N: usize> {
     /// An error would stay or grow along some direction.
     #[error(
         "the decay matrix has the eigenvalues {eigenvalues}; all of them must have a negative real part (by more than \
-         {tolerance:e}, to which they are known), or the estimate does not converge"
+         {tolerance:.1e}, to which they are known), or the estimate does not converge"
     )]
     NotHurwitz {
         /// All eigenvalues.
@@ -280,9 +280,9 @@ mod tests {
             assert!(matches!(refusal, HurwitzError::NotHurwitz { .. }), "{matrix}: {refusal}");
         }
         let message = format!("{}", Hurwitz::new(Matrix2::new(1.0, 2.0, -2.0, 1.0)).unwrap_err());
-        assert!(message.contains("1+2i, 1-2i"), "{message}");
+        assert!(message.contains("1.000+2.000i, 1.000-2.000i"), "{message}");
         let message = format!("{}", Hurwitz::new(still).unwrap_err());
-        assert!(message.contains("-1, 0, -1;"), "{message}");
+        assert!(message.contains("-1.000, 0, -1.000;"), "{message}");
     }
 
     #[test]
