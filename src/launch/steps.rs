@@ -9,9 +9,9 @@ use crate::bus::memory::MemoryBus;
 use crate::bus::{BusError, Reader, Signal, WordReader};
 use crate::config::ClockKind;
 use crate::runtime::{
-    Poll, ReadyNode, RoleFunction, RoleId, RoleImpl, RunCondition, TickSamples, depths, ports, private_ledger, report,
+    ReadyNode, RoleFunction, RoleId, RoleImpl, TickSamples, depths, ports, private_ledger, report, run_in_turn,
 };
-use crate::sample::Field;
+use crate::sample::{Field, Order, Place, Stamp};
 use crate::scenario::Scenario;
 use crate::scenario::build;
 use crate::scenario::scorer as open_scorer;
@@ -47,8 +47,8 @@ pub struct Steps {
     seats: Vec<(RoleId, Ledger)>,
     nodes: Vec<ReadyNode>,
     scorer: Box<dyn Scorer>,
-    /// What the controller reads, and the last sample of each; none of a tick without.
-    readers: Vec<WordReader>,
+    /// The controller's inputs with the order of their samples, and each sample of the current tick.
+    readers: Vec<(WordReader, Order)>,
     inputs: Vec<Option<Vec<u64>>>,
     outputs: Vec<Port>,
     commands: Rc<RefCell<Vec<Vec<u64>>>>,
@@ -137,7 +137,10 @@ impl Steps {
         let scorer = open_scorer(&scenario, &bus)?;
         let seats: Vec<(RoleId, Ledger)> =
             roles.into_iter().map(|role| (role, private_ledger(&scenario, role))).collect();
-        let readers = of_controller.reads.iter().map(|port| port.reader(&bus, Reader::Scorer));
+        let readers = of_controller
+            .reads
+            .iter()
+            .map(|port| Ok::<_, BusError>((port.reader(&bus, Reader::Scorer)?, Order::default())));
         let readers = readers.collect::<Result<Vec<_>, _>>()?;
         let content = |port: &Port| vec![0; port.size / size_of::<u64>() - STAMP];
         let commands = Rc::new(RefCell::new(of_controller.writes.iter().map(content).collect()));
@@ -168,12 +171,11 @@ impl Steps {
         for node in &mut self.nodes[..controller] {
             step(node, self.tick)?;
         }
-        for (reader, input) in self.readers.iter_mut().zip(&mut self.inputs) {
+        for ((reader, order), input) in self.readers.iter_mut().zip(&mut self.inputs) {
             let room = input.take();
             while let Some(words) = reader.next()? {
-                // A sample of this tick; no other tick's, and no marker that there is none.
-                let stamp: &crate::sample::Stamp = bytemuck::from_bytes(bytemuck::cast_slice(&words[..STAMP]));
-                if stamp.tick == self.tick && stamp.generation & crate::sample::NO_SAMPLE == 0 && stamp.generation > 0 {
+                let stamp: &Stamp = bytemuck::from_bytes(bytemuck::cast_slice(&words[..STAMP]));
+                if order.place(stamp, self.tick) == Place::Sample && stamp.tick == self.tick {
                     let mut kept = room.clone().unwrap_or_default();
                     kept.clear();
                     kept.extend_from_slice(words);
@@ -255,14 +257,11 @@ impl Steps {
 }
 
 /// Words of a stamp.
-const STAMP: usize = size_of::<crate::sample::Stamp>() / size_of::<u64>();
+const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
 
 fn step(node: &mut ReadyNode, tick: u64) -> Result<(), LaunchError> {
     if node.before_tick() {
         return Err(LaunchError::NotStepped { reason: "a fault kills one of its roles" });
     }
-    if node.poll(RunCondition::Inputs { up_to: tick })? == Poll::Executed {
-        node.finish_tick()?;
-    }
-    Ok(())
+    Ok(run_in_turn(node, tick)?)
 }

@@ -10,7 +10,7 @@ use super::recorder::{END, RUN, SCHEMA, SignalReport, layouts};
 use super::writer::{CHECKSUM, checksum};
 use crate::config::{RunId, ScriptedFault};
 use crate::files;
-use crate::sample::{CDR_HEADER, FieldKind, Layout, NO_SAMPLE, Stamp};
+use crate::sample::{CDR_HEADER, FieldKind, Layout, Order, Place, Stamp};
 use crate::scenario::Scenario;
 use crate::telemetry::{Grant, Ticks};
 use mcap::records::{Record, op};
@@ -383,15 +383,9 @@ impl Track {
 
     /// Returns the indexes of the regular samples: the first of each tick, in ascending order, without no-sample markers.
     pub fn regular(&self) -> impl Iterator<Item = usize> + '_ {
-        let mut next = 0;
-        (0..self.len()).filter(move |index| {
-            let stamp = self.stamp(*index);
-            let first = stamp.tick >= next && stamp.generation & NO_SAMPLE == 0;
-            if first {
-                next = stamp.tick.saturating_add(1);
-            }
-            first
-        })
+        let mut order = Order::default();
+        (0..self.len())
+            .filter(move |index| matches!(order.place(&self.stamp(*index), u64::MAX), Place::Sample | Place::Unused))
     }
 
     /// Returns a field's element over all [regular](Self::regular) samples; `None` if there is no such field.

@@ -89,7 +89,7 @@ impl SignalReport {
             published: None,
             lost: None,
             lost_between_hosts: 0,
-            last_tick: counters.next.checked_sub(1),
+            last_tick: counters.order.next().checked_sub(1),
             gaps: counters.gaps,
             more_gaps: counters.more_gaps,
         }

@@ -9,7 +9,7 @@ use crate::bus::{AnyBus, BusError, Reader, WordReader};
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::ClockKind;
 use crate::runtime::{RoleId, ports};
-use crate::sample::{Layout, NO_SAMPLE, Stamp};
+use crate::sample::{Layout, Order, Place, Stamp};
 use crate::scenario::Scenario;
 use std::collections::BTreeMap;
 
@@ -49,9 +49,8 @@ pub trait MessageSink {
 /// Counters of the samples of one signal.
 #[derive(Default)]
 pub struct SignalCounters {
-    /// The tick after the last one with a sample or marker.
-    pub next: u64,
-    begun: bool,
+    /// The ticks with a sample or marker so far.
+    pub order: Order,
     /// Number of ticks with a sample.
     pub recorded: u64,
     /// Number of ticks with a no-sample marker.
@@ -67,19 +66,22 @@ pub struct SignalCounters {
 impl SignalCounters {
     /// Counts a sample or marker; `max_tick` is the last tick that it can have.
     fn count(&mut self, stamp: &Stamp, max_tick: u64) {
-        if stamp.tick < self.next || stamp.tick > max_tick {
-            self.extra += 1;
-            return;
+        let next = self.order.next();
+        match self.order.place(stamp, max_tick) {
+            Place::WarmUp => {}
+            Place::Extra => self.extra += 1,
+            place => {
+                self.add_gap(next, stamp.tick);
+                *(if place == Place::NoSample { &mut self.void } else { &mut self.recorded }) += 1;
+            }
         }
-        self.add_gap_before(stamp.tick);
-        *(if stamp.generation & NO_SAMPLE == 0 { &mut self.recorded } else { &mut self.void }) += 1;
-        (self.next, self.begun) = (stamp.tick + 1, true);
     }
 
-    fn add_gap_before(&mut self, tick: u64) {
-        if tick > self.next {
+    /// Adds the gap from a missing tick to the one before `tick`, if there is one.
+    fn add_gap(&mut self, missing: u64, tick: u64) {
+        if tick > missing {
             if self.gaps.len() < GAPS_LISTED {
-                self.gaps.push([self.next, tick - 1]);
+                self.gaps.push([missing, tick - 1]);
             } else {
                 self.more_gaps += 1;
             }
@@ -112,15 +114,15 @@ impl Tap {
         while let Some(words) = self.reader.next()? {
             let body = bytemuck::cast_slice(words);
             let stamp: Stamp = bytemuck::pod_read_unaligned(&body[..size_of::<Stamp>()]);
-            if (stamp.generation == 0 || context.joined.is_some_and(|from| stamp.tick < from)) && !self.counters.begun {
+            let order = &self.counters.order;
+            if (stamp.generation == 0 || context.joined.is_some_and(|from| stamp.tick < from)) && !order.begun() {
                 continue;
             }
             let now_ns = monotonic_ns();
-            let max_tick = match (context.realtime, self.counters.begun) {
-                (true, _) => context.grid.tick_at(now_ns).min(context.last_tick),
-                // A lossless link delivers the next tick; any other tick is malformed.
-                (false, true) if context.joined.is_none() => self.counters.next,
-                (false, _) => context.last_tick,
+            let max_tick = match context.realtime.then(|| context.grid.tick_at(now_ns)) {
+                // Who joins a run in lockstep may have lost samples.
+                None if context.joined.is_some() => context.last_tick,
+                due_tick => order.max_tick(due_tick, context.last_tick),
             };
             let due_ns = if stamp.tick <= context.last_tick { context.grid.due_ns(stamp.tick) } else { now_ns };
             // Without real time, the due time of the tick is the only meaningful one.
@@ -213,7 +215,7 @@ impl Taps {
 
     /// Returns the first tick that some signal still lacks.
     pub fn next_tick(&self) -> u64 {
-        self.taps.iter().map(|tap| tap.counters.next).min().unwrap_or(0)
+        self.taps.iter().map(|tap| tap.counters.order.next()).min().unwrap_or(0)
     }
 
     /// Closes all signals and returns their services and counters.

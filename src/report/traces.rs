@@ -7,7 +7,7 @@ use super::columns::{Columns, Corners, Count, Extremes};
 use crate::bus::Signal;
 use crate::record::{RecordError, Recording, SignalInfo};
 use crate::rig::{Picture, Plane, WordGuard};
-use crate::sample::{Column, FieldKind, NO_SAMPLE, Stamp, status};
+use crate::sample::{Column, FieldKind, Order, Place, Stamp, status};
 use crate::scenario::AnyRig;
 use crate::scenario::Scenario;
 use crate::score::lyapunov_floor;
@@ -86,7 +86,7 @@ struct SignalTrace {
     guard: Option<Box<dyn WordGuard>>,
     body: usize,
     role: Option<usize>,
-    last: Option<u64>,
+    order: Order,
     /// The index of the status word, if the samples have one.
     status: Option<usize>,
     /// The traced fields.
@@ -175,15 +175,17 @@ impl Tracer {
 
     fn take(&mut self, index: usize, received_ns: u64, sample: &[u8]) {
         let stamp: Stamp = bytemuck::pod_read_unaligned(&sample[..size_of::<Stamp>()]);
-        let (tick, possible) = (stamp.tick, self.possible(index, stamp.tick, received_ns));
-        let signal = &mut self.signals[index];
-        if !possible || signal.last.is_some_and(|last| tick <= last) || stamp.generation == 0 {
+        let (tick, signal) = (stamp.tick, &mut self.signals[index]);
+        // A recorder may read its clock just before a tick.
+        let due_tick = received_ns.saturating_sub(self.epoch_ns) / self.period_ns + 1;
+        let max_tick = signal.order.max_tick((self.epoch_ns > 0).then_some(due_tick), self.last_tick);
+        let place = signal.order.place(&stamp, max_tick);
+        if !matches!(place, Place::NoSample | Place::Sample) {
             return;
         }
-        signal.last = Some(tick);
         let (first, last) = self.traces.ticks.unwrap_or((tick, tick));
         self.traces.ticks = Some((first.min(tick), last.max(tick)));
-        if stamp.generation & NO_SAMPLE != 0 {
+        if place == Place::NoSample {
             return;
         }
         if let Some(role) = signal.role {
@@ -202,14 +204,6 @@ impl Tracer {
         if self.accepted(index, tick, sample) {
             self.signals[index].fields.iter_mut().for_each(|field| field.take(tick, sample));
         }
-    }
-
-    /// Returns true if the tick of a sample is possible: in real time it was due, else it is the next one. Detects broken
-    /// stamps.
-    fn possible(&self, signal: usize, tick: u64, received_ns: u64) -> bool {
-        let next = self.signals[signal].last.is_none_or(|last| last.checked_add(1) == Some(tick));
-        let due = received_ns.saturating_sub(self.epoch_ns) / self.period_ns;
-        tick <= self.last_tick && if self.epoch_ns > 0 { tick <= due.saturating_add(1) } else { next }
     }
 
     /// Stores the sample if a metric needs it; returns true if its guard accepts it.
@@ -343,7 +337,7 @@ impl SignalTrace {
         };
         let fields = columns.enumerate().map(field).collect();
         let status = named("status").map(|status| status.offset / size_of::<u64>());
-        Self { kind, guard, body, role: role(info, traces), last: None, status, fields }
+        Self { kind, guard, body, role: role(info, traces), order: Order::default(), status, fields }
     }
 }
 

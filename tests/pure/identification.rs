@@ -269,7 +269,7 @@ fn a_matrix_without_decay_is_refused_with_its_eigenvalues() {
     let refusal = Hurwitz::new(matrix).unwrap_err();
     assert!(matches!(refusal, HurwitzError::NotHurwitz { .. }));
     println!("{refusal}");
-    assert!(refusal.to_string().contains("0.5+2i, 0.5-2i"), "{refusal}");
+    assert!(refusal.to_string().contains("0.5000+2.000i, 0.5000-2.000i"), "{refusal}");
 }
 
 #[test]

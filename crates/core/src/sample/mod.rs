@@ -9,6 +9,7 @@ mod definition;
 mod fleet;
 mod layout;
 mod orbit;
+mod order;
 mod rigid;
 mod run;
 
@@ -19,6 +20,7 @@ pub use fleet::{
 };
 pub use layout::{LayoutName, type_name_of};
 pub use orbit::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth};
+pub use order::{Order, Place};
 pub use rigid::{RateCommand, RateEstimate, RateMeasurement, RateTruth};
 pub use run::{Health, Phase, RoleState, Schedule};
 

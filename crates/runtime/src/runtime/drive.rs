@@ -376,10 +376,7 @@ pub fn drive_in_turn_tracked(
                 let Some(successor) = revive(index)? else { return leave(nodes, Ended::Stopped) };
                 nodes.insert(index, successor);
             }
-            let node = &mut nodes[index];
-            if node.poll(RunCondition::Inputs { up_to: tick })? == Poll::Executed {
-                node.finish_tick()?;
-            }
+            run_in_turn(&mut nodes[index], tick)?;
         }
         turn.set(None);
         if !after_tick(tick) {
@@ -387,6 +384,17 @@ pub fn drive_in_turn_tracked(
         }
     }
     leave(nodes, Ended::Finished)
+}
+
+/// Lets a node execute a tick in its turn, if its inputs are there.
+///
+/// # Errors
+/// [`NodeError`] if a link failed.
+pub fn run_in_turn(node: &mut ReadyNode, tick: u64) -> Result<(), NodeError> {
+    if node.poll(RunCondition::Inputs { up_to: tick })? == Poll::Executed {
+        node.finish_tick()?;
+    }
+    Ok(())
 }
 
 fn leave(nodes: &mut [ReadyNode], ended: Ended) -> Result<Ended, NodeError> {

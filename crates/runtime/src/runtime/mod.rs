@@ -22,8 +22,7 @@ mod sample_source;
 pub use budget::{empty_budgets, grant_budgets};
 pub use device::{DeviceConfig, DeviceLink};
 pub use disturb::{Disturbance, Interruptions, LateSamples};
-pub use drive::drive_in_turn_tracked;
-pub use drive::{Backoff, Driver, Ended, LauncherLink, drive_in_turn};
+pub use drive::{Backoff, Driver, Ended, LauncherLink, drive_in_turn, drive_in_turn_tracked, run_in_turn};
 pub use error::{DeviceError, NodeError};
 pub use line::{Line, LineError};
 #[cfg(feature = "hosts")]

@@ -82,7 +82,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     }
 }
 
-/// What a controller does with every channel.
+/// The operations of a controller on each of its channels.
 pub trait AnyChannel<E> {
     /// Accepts the samples that a predecessor has already used.
     fn expect_repeats(&mut self);
