@@ -482,9 +482,9 @@ impl Rig for RigidBodyRig {
         };
         let (i, j) = (axis % 3 + 1, (axis + 1) % 3 + 1);
         let conditions = vec![
-            condition(&format!("[D](19) |k{i}| > |a{i}| M, 1/s"), certificate.paper[0]),
-            condition(&format!("[D](19) |k{j}| > |a{j}| M, 1/s"), certificate.paper[1]),
-            condition("[D](19) decay rate > |ai| M + |aj| M + |kk|/2, 1/s", certificate.paper[2]),
+            condition(&format!("|k{i}| > |a{i}| M, 1/s"), certificate.paper[0]),
+            condition(&format!("|k{j}| > |a{j}| M, 1/s"), certificate.paper[1]),
+            condition("decay rate > |ai| M + |aj| M + |kk|/2, 1/s", certificate.paper[2]),
             condition("exact (Schur) decay rate, 1/s", certificate.exact),
             condition("sampled axis: stability limit > |k| h", certificate.gain_step),
         ];
