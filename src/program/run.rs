@@ -96,14 +96,15 @@ pub struct Arguments {
 }
 
 const EXAMPLES: &str = "\
-A name selects a shipped scenario; `corotate init --list` prints all. Give a file
-in this directory as ./NAME or NAME.toml. runs/latest links to the newest run.
+A name selects a shipped scenario; `corotate init --list` prints all. Write a
+file in this directory as ./NAME or NAME.toml. runs/latest links to the newest
+run.
 
-The last line is the verdict. PASS: all judged criteria of [accept] hold. FAIL: a
-criterion does not hold, or the run failed. NOT JUDGED: the run proves nothing,
-for it has no criteria or no score, was stopped, or is shorter than settled_by_s.
-The line counts missed, starved and safe ticks. It is on stdout; with --json on
-stderr. If the run could not begin, an error takes its place.
+The last line is the verdict. PASS: all judged criteria of [accept] hold. FAIL:
+a criterion does not hold, or the run failed. NOT JUDGED: the run has no
+criteria or no score, was stopped, or is shorter than settled_by_s. The line
+counts missed, starved and safe ticks. It is on stdout; with --json on stderr.
+If the run could not begin, an error takes its place.
 
 Examples:
   corotate run rigid-trio          a shipped scenario

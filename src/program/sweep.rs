@@ -79,8 +79,8 @@ struct MergeArguments {
 }
 
 const EXAMPLES: &str = "\
-An interrupted campaign (Ctrl-C, kill -9) resumes if the command is repeated with
-the same --out. The table is the same.
+An interrupted campaign (Ctrl-C, kill -9) resumes if the command is repeated
+with the same --out. The table is the same.
 
 Examples:
   corotate sweep timing-map        a shipped campaign; the table is in

@@ -33,10 +33,10 @@ fn seconds(text: &str) -> Result<f64, String> {
 }
 
 const EXAMPLES: &str = "\
-Keys: q: quit; space: pause; up, down, tab: select a signal; left, right: scroll
-its fields. Latencies are median/99 % of the last 4096 samples, from the samples'
-stamps: due-sent from the tick's due time to the sending of the role's sample,
-in-sent from the sending of the input to that of the role's sample.
+Keys: q: quit; space: pause; up, down, tab: select a signal; left, right:
+scroll its fields. Latencies are median/99 % of the last 4096 samples, from the
+samples' stamps: due-sent from the tick's due time to the sending of the role's
+sample, in-sent from the sending of the input to that of the role's sample.
 
 Examples:
   corotate run & corotate watch    your newest run
