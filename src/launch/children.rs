@@ -1,9 +1,9 @@
-//! The processes of a run: started from this program, listened to, reaped.
+//! The processes of a run: started from this program, their output read, reaped.
 //!
-//! A role dies with its launcher by the kernel's hand (parent-death signal). Must not leave a zombie.
+//! The kernel ends a role with its launcher (parent-death signal). Must not leave a zombie.
 
 use super::LaunchError;
-use super::incident::Failure;
+use super::incident::RoleFailure;
 use super::standstill::is_zombie;
 use crate::bus::domain::Domain;
 use crate::panics::Panic;
@@ -23,28 +23,28 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// The time that a role may take to end after the order to end.
+/// Time that a role may take to end after the stop.
 pub(super) const END_LIMIT: Duration = Duration::from_secs(5);
-/// The interval between two checks whether a killed process has ended.
+/// Interval between two checks if a killed process has ended.
 const KILL_LOOK: Duration = Duration::from_micros(200);
-/// The exit code of a program of ours that failed.
+/// Exit code of this program after a failure.
 const FAILURE: i32 = 1;
-/// The part of a role's error output that is kept.
+/// Length of the part of a role's error output that is kept.
 const LAST_LINES: usize = 8;
 
 /// A role's process.
 pub(super) struct RoleProcess {
     child: Child,
     status: Option<ExitStatus>,
-    /// Readable once the process has ended; none on a kernel without.
+    /// Readable once the process has ended; `None` on a kernel without such descriptors.
     handle: Option<OwnedFd>,
     last_words: Arc<Mutex<VecDeque<String>>>,
-    /// The file to which it writes its panic.
+    /// The file for its panic.
     panic: Option<PathBuf>,
     listener: Option<JoinHandle<()>>,
 }
 
-/// This program, to be started in a role.
+/// This program, for starting it in a role.
 pub fn program(role: &str) -> Result<Command, LaunchError> {
     this_program().map_err(|source| LaunchError::Spawn { role: role.to_owned(), source })
 }
@@ -64,7 +64,7 @@ impl RoleProcess {
         Ok(process)
     }
 
-    /// Starts what dies with this process and is listened to under a name.
+    /// Starts a process that ends with this one, and whose output is printed under a name.
     pub fn spawn(mut command: Command, name: String) -> Result<Self, LaunchError> {
         command.arg("--parent").arg(std::process::id().to_string());
         // A group of its own: Ctrl-C reaches the launcher alone, and the launcher ends the roles in order.
@@ -81,12 +81,12 @@ impl RoleProcess {
         Ok(process)
     }
 
-    /// The process's identifier.
+    /// Returns the process identifier.
     pub fn pid(&self) -> i32 {
         self.child.id() as i32
     }
 
-    /// Undoes a stop by a signal.
+    /// Continues the process after a stop by a signal.
     pub fn resume(&mut self) {
         if let (None, Some(pid)) = (self.ended(), Pid::from_raw(self.pid())) {
             let _ = kill_process(pid, Signal::CONT);
@@ -106,13 +106,13 @@ impl RoleProcess {
         self.handle.as_ref().filter(|_| self.status.is_none())
     }
 
-    /// The panic that it has left, if it has.
-    pub fn panic(&self) -> Option<Failure> {
-        self.panic.as_deref().and_then(Panic::take).map(Failure::of)
+    /// Returns the panic that ended it, if one did.
+    pub fn panic(&self) -> Option<RoleFailure> {
+        self.panic.as_deref().and_then(Panic::take).map(RoleFailure::from_panic)
     }
 
     /// Returns the failure of a role that ended early.
-    pub fn failure(&mut self, status: ExitStatus) -> Failure {
+    pub fn failure(&mut self, status: ExitStatus) -> RoleFailure {
         // A panic is caught by our own `main`, or ends the process by SIGABRT.
         let panicked = status.code() == Some(FAILURE) || status.signal() == Some(libc::SIGABRT);
         if let Some(failure) = self.panic().filter(|_| panicked) {
@@ -123,17 +123,17 @@ impl RoleProcess {
             (None, Some(signal)) => ("killed", format!("it was killed by {}", signal_name(signal))),
             (None, None) => ("ended", "it ended".to_owned()),
         };
-        Failure::new(code, cause, self.last_words())
+        RoleFailure::new(code, cause, self.last_words())
     }
 
-    /// An error if the process has ended before the ticks run.
+    /// Returns an error if the process has ended before the ticks run.
     pub fn require_alive(&mut self, name: &str) -> Result<(), LaunchError> {
         let Some(status) = self.ended() else { return Ok(()) };
-        let Failure { cause, last_words, .. } = self.failure(status);
+        let RoleFailure { cause, last_words, .. } = self.failure(status);
         Err(LaunchError::Died { role: name.to_owned(), cause, last_words })
     }
 
-    /// The end of the error output of a process that has ended.
+    /// Returns the end of the error output of an ended process.
     pub fn last_words(&mut self) -> String {
         self.stop_listening();
         let words = self.last_words.lock().map(|lines| lines.iter().cloned().collect::<Vec<_>>()).unwrap_or_default();
@@ -149,7 +149,7 @@ impl RoleProcess {
             let _ = sched_setaffinity(Pid::from_raw(self.child.id() as i32), &any);
             let _ = self.child.kill();
             while self.ended().is_none() {
-                // A debugger that holds it has its status, and may keep that for ever.
+                // A debugger that holds it may keep its exit status for ever.
                 if is_zombie(self.pid()) {
                     self.status = self.ended().or(Some(ExitStatus::from_raw(libc::SIGKILL)));
                 } else {
@@ -184,7 +184,7 @@ fn signal_name(signal: i32) -> String {
     }
 }
 
-/// Passes a role's error output on, its name in front, and keeps the end of it.
+/// Prints a role's error output with its name in front, and keeps the end of it.
 fn listen(
     name: String,
     stderr: impl Read + Send + 'static,

@@ -1,10 +1,10 @@
-//! A process of a run that is no role: started, waited for until it is ready, watched, and let go.
+//! A process of a run besides the roles: started, ready, supervised, ended.
 //!
-//! Its owner gives its command and decides what its end means. Must not end a run.
+//! Its owner gives the command, and decides how to react to its end. Must not end a run.
 
 use super::LaunchError;
 use super::children::{RoleProcess, program};
-use super::incident::Failure;
+use super::incident::RoleFailure;
 use super::janitor::Janitor;
 use crate::system::tell;
 use std::path::Path;
@@ -20,7 +20,7 @@ pub(super) struct Companion {
 }
 
 impl Companion {
-    /// Starts this program under a name if there are `arguments`, which complete its command.
+    /// Starts this program under a name with these arguments, if there are any.
     pub fn start(name: &'static str, arguments: Option<impl FnOnce(&mut Command)>) -> Result<Self, LaunchError> {
         let mut companion = Self { name, process: None, ready: false, failed: false };
         if let Some(complete) = arguments {
@@ -31,12 +31,12 @@ impl Companion {
         Ok(companion)
     }
 
-    /// The name and the process.
+    /// Returns the name and the process.
     pub fn process(&mut self) -> (&str, Option<&mut RoleProcess>) {
         (self.name, self.process.as_mut())
     }
 
-    /// Returns true once the companion has written `file`, whose text is printed if there is any, or if there is no process.
+    /// Returns true once the companion has written `file`, whose text is then printed, or if there is no process.
     ///
     /// # Errors
     /// [`LaunchError::Died`] if it has ended.
@@ -52,21 +52,21 @@ impl Companion {
         Ok(self.ready)
     }
 
-    /// Returns how the process failed, once, if it has ended.
-    pub fn failure(&mut self) -> Option<Failure> {
+    /// Returns, once, the failure of a process that has ended.
+    pub fn failure(&mut self) -> Option<RoleFailure> {
         let process = self.process.as_mut().filter(|_| !self.failed)?;
         let status = process.ended()?;
         self.failed = true;
         Some(process.failure(status))
     }
 
-    /// Returns why the run goes on without the companion, once, and prints it. One that is `silent` is ended.
+    /// Returns and prints, once, the reason for which the run goes on without the companion. A `silent` one is killed.
     pub fn loss(&mut self, silent: bool, janitor: &mut Janitor) -> Option<String> {
         let cause = match self.failure() {
             Some(failure) => failure.cause,
             None if silent => {
                 self.process.as_mut().map(RoleProcess::kill);
-                "it said nothing any more".to_owned()
+                "it sent no status any more".to_owned()
             }
             None => return None,
         };
@@ -75,7 +75,7 @@ impl Companion {
         Some(cause)
     }
 
-    /// True while the process runs.
+    /// Returns true while the process runs.
     pub fn lingers(&mut self) -> bool {
         self.process.as_mut().is_some_and(|process| process.ended().is_none())
     }

@@ -1,6 +1,6 @@
-//! The criteria of a run: each value beside its limit, and what follows for the run as a whole.
+//! The criteria of a run: each value beside its limit, and the verdict on the whole run.
 //!
-//! Must not pass what was not seen: a criterion that lacks a part of what it is about is not judged, and with it the run.
+//! Must not pass what was not measured: a criterion without all its data is not judged, and neither is the run.
 
 use super::outcome::{Accounting, StageFigures, links_of};
 use super::{Action, Outcome};
@@ -31,7 +31,7 @@ pub struct Criterion {
     /// The role with the largest value, where each has its own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub role: Option<String>,
-    /// Why it is not judged.
+    /// The reason for which it is not judged.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<Unjudged>,
     /// True if the scenario states no such limit, and the default holds.
@@ -53,16 +53,16 @@ fn is_count(value: f64) -> bool {
     value.fract() == 0.0 && value.abs() < 1e9
 }
 
-/// Why a criterion is not judged.
+/// The reason for which a criterion is not judged.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Unjudged {
-    /// The clock does not measure it, whatever happens.
+    /// The clock does not measure it.
     Clock,
     /// The run was stopped before it applies.
     Stopped,
-    /// By the scenario the run ends before it applies: the key of the instant, and the instant, s.
+    /// The scenario ends before it applies: the key of the instant, and the instant, s.
     Early(&'static str, f64),
-    /// So many of so many ticks from an instant on, s, have no score.
+    /// Ticks have no score: their number, the number of all ticks from an instant on, and that instant, s.
     Unscored(u64, u64, f64),
     /// The role keeps no counters.
     Unbooked,
@@ -103,7 +103,7 @@ impl Criterion {
         Self { name: name.into(), limit, value, holds, role: None, reason: None, default: false }
     }
 
-    /// The name, with what a reader must know of it.
+    /// Returns the name, with the role, and a mark if the limit is the default.
     pub(super) fn label(&self) -> String {
         let role = self.role.as_ref().map_or(String::new(), |role| format!(", {role}"));
         format!("{}{}{role}", self.name, if self.default { " (default)" } else { "" })
@@ -138,12 +138,12 @@ pub(super) struct Judge<'a> {
 }
 
 impl Judge<'_> {
-    /// Holds the results against the criteria.
+    /// Judges the results by the criteria.
     pub fn criteria(&self) -> Vec<Criterion> {
         let accept = &self.scenario.accept;
         let mut criteria = self.metrics();
         let score = &self.outcome.score;
-        // Asked for or not: a run that lost a body is not accepted.
+        // Not optional: a run that lost a body is not accepted.
         if score.faulted_ticks > 0 {
             criteria.push(Criterion::new("faulted_ticks_max", 0.0, Some(score.faulted_ticks as f64)));
         }
@@ -188,7 +188,7 @@ impl Judge<'_> {
         settled.chain(peaks).collect()
     }
 
-    /// Why a metric cannot be judged from an instant on, if it cannot: `blank` ticks from there on have none.
+    /// Returns the reason for which a metric cannot be judged from an instant on, if there is one; `blank` ticks have no value.
     fn unseen(&self, key: &'static str, from_s: f64, value: Option<f64>, blank: u64) -> Option<Unjudged> {
         let last_tick = self.scenario.last_tick;
         if self.scenario.time_s(last_tick) < from_s {
@@ -204,20 +204,20 @@ impl Judge<'_> {
         let blank = self.unscored(from_tick, blank);
         let allowed = match self.scenario.accept.unscored_ticks_max {
             Some(amount) => amount.count(ticks),
-            // A tick that a role missed is without a sample, and counted as missed. One that was sent and not scored may have
-            // been the worst.
+            // A tick that a role missed has no sample, and counts as missed. A sample that was sent but not scored may have been the
+            // worst.
             None if self.lost_samples() == Some(0) => DEFAULT_SHARE.count(ticks),
             None => 0,
         };
         (blank > allowed).then_some(Unjudged::Unscored(blank, ticks, from_s))
     }
 
-    /// Returns the number of ticks from one on.
+    /// Returns the number of ticks from `from_tick` on.
     fn ticks_from(&self, from_tick: u64) -> u64 {
         self.scenario.last_tick + 1 - from_tick
     }
 
-    /// Returns the number of ticks from one on without a score: those that the scorer passed over, and those that it did not come to.
+    /// Returns the number of ticks from `from_tick` on without a score: those that the scorer passed over, and those after its end.
     fn unscored(&self, from_tick: u64, passed_over: u64) -> u64 {
         let score = &self.outcome.score;
         let end = score.scored_ticks + score.unscored_ticks;
@@ -233,15 +233,15 @@ impl Judge<'_> {
             let writer = written().find(|link| link.service == *service)?;
             Some(writer.published.saturating_sub(*received))
         });
-        lost.reduce(|all, one| all + one)
+        lost.reduce(|sum, count| sum + count)
     }
 
-    /// The criteria on ticks that were missed, starved and safe, stated or by default.
+    /// Returns the criteria on missed, starved and safe ticks, stated or by default.
     fn ticks(&self) -> Vec<Criterion> {
         let accept = &self.scenario.accept;
         let roles = self.roles();
         let scripted = self.scripted_ticks();
-        // A number counts every tick; a share grants what the scenario's own faults take, besides.
+        // A count limits all ticks; a share does not include the ticks that the scenario's own faults take.
         let granted = |amount: TickAmount, ticks: u64| match amount {
             TickAmount::Count(count) => count,
             TickAmount::Share(_) => amount.count(ticks) + scripted,
@@ -258,7 +258,7 @@ impl Judge<'_> {
             ("safe_ticks_max", &accept.safe_ticks_max, |role| role.safe, TickAmount::Share(0.0)),
         ] {
             match limit {
-                // The number that older scenarios have.
+                // As in older scenarios: the sum over all roles.
                 Some(TickLimit::All(TickAmount::Count(limit))) if name == "missed_ticks_max" => {
                     let all =
                         roles.iter().map(|role| role.missed.unwrap_or(0) + role.starved.unwrap_or(0)).sum::<u64>();
@@ -288,7 +288,7 @@ impl Judge<'_> {
         criteria
     }
 
-    /// The roles' counts. What a role without counters missed is what its readers lack.
+    /// Returns the roles' counts. A role without counters missed the ticks that its readers lack.
     fn roles(&self) -> Vec<Counted<'_>> {
         let booked = self.books.roles.iter().map(|(role, ticks)| {
             let Ticks { elapsed, missed, starved, safe, .. } = *ticks;
@@ -307,7 +307,7 @@ impl Judge<'_> {
         booked.unwrap_or(if self.interrupted { 0 } else { self.scenario.last_tick + 1 })
     }
 
-    /// The roles that no sample came of any more at the end of the run.
+    /// Returns the roles that sent no more samples at the end of the run.
     fn absent_roles(&self) -> Vec<&str> {
         if self.interrupted {
             return Vec::new();
@@ -324,7 +324,7 @@ impl Judge<'_> {
         self.books.unbooked.iter().filter(absent).map(String::as_str).collect()
     }
 
-    /// Returns the number of ticks that scripted faults may have cost any one role.
+    /// Returns the largest number of ticks that scripted faults may have cost a role.
     fn scripted_ticks(&self) -> u64 {
         let (scenario, period_ns) = (self.scenario, self.scenario.period_ns);
         let stall_ticks = scenario.faults.iter().map(|fault| match fault.fault.action {
@@ -348,7 +348,7 @@ impl Judge<'_> {
     }
 }
 
-/// Returns the criterion of the role that is closest to its limit, or furthest beyond; none if no role counts such ticks.
+/// Returns the criterion of the role that is closest to its limit, or furthest beyond; `None` if no role counts such ticks.
 fn worst(
     name: &str,
     roles: &[Counted<'_>],
@@ -361,8 +361,8 @@ fn worst(
     Some(Criterion { role, ..Criterion::new(name, limit as f64, Some(ticks as f64)) })
 }
 
-/// Returns true if a run is accepted by its criteria; none if nothing was judged, if the run was `interrupted` before
-/// anything failed, or if something could not be judged that the run should have shown.
+/// Returns true if a run is accepted by its criteria; `None` if nothing was judged, if the run was `interrupted` before
+/// anything failed, or if a criterion could not be judged that the run should have measured.
 pub(super) fn accepted(criteria: &[Criterion], interrupted: bool) -> Option<bool> {
     if criteria.iter().any(|criterion| criterion.holds == Some(false)) {
         return Some(false);
@@ -372,12 +372,12 @@ pub(super) fn accepted(criteria: &[Criterion], interrupted: bool) -> Option<bool
     (judged && !interrupted && first_open(criteria).is_none()).then_some(true)
 }
 
-/// The first reason for which a run cannot be accepted.
+/// Returns the first reason for which a run cannot be accepted.
 fn first_open(criteria: &[Criterion]) -> Option<&Unjudged> {
     criteria.iter().filter_map(|criterion| criterion.reason.as_ref()).find(|reason| **reason != Unjudged::Clock)
 }
 
-/// The verdict in words.
+/// Returns the verdict in words.
 pub(super) fn verdict(accepted: Option<bool>, criteria: &[Criterion], interrupted: bool) -> String {
     match accepted {
         Some(true) => "accepted".to_owned(),
@@ -391,8 +391,7 @@ pub(super) fn verdict(accepted: Option<bool>, criteria: &[Criterion], interrupte
     }
 }
 
-/// The ticks that roles missed, lacked an input for, or were safe at, by role: `missed: controller 12; safe: follower 3`. Empty if
-/// there are none.
+/// Returns the missed, starved and safe ticks by role: `missed: controller 12; safe: follower 3`. Empty without such ticks.
 pub fn tick_words(books: &Accounting) -> String {
     let words = ["missed", "starved", "safe"].into_iter().filter_map(|kind| {
         let booked = books.roles.iter().map(|(role, ticks)| {
@@ -429,7 +428,7 @@ mod tests {
         assert_eq!(exact(f64::INFINITY), "inf");
     }
 
-    /// A run that is well, of a scenario with these changes, and what is judged of it once it has been changed.
+    /// Returns the verdict on an undisturbed run of a scenario with these overrides, after `change` was applied to its outcome.
     fn judged(overrides: &[&str], change: impl FnOnce(&mut Outcome)) -> (Option<bool>, String, Vec<Criterion>) {
         let overrides: Vec<String> =
             ["clock=in-process"].iter().chain(overrides).map(|text| (*text).to_owned()).collect();
@@ -450,7 +449,7 @@ mod tests {
         broken.map(|criterion| (&*criterion.name, criterion.role.as_deref())).collect()
     }
 
-    /// 151 of 10001 ticks, as a slow controller misses them, are more than the share that is granted; stated or by default.
+    /// A slow controller misses 151 of 10001 ticks: more than the allowed share, stated or by default.
     #[test]
     fn more_than_the_share_of_a_roles_ticks_is_not_accepted() {
         let metrics = "accept={settled_by_s=8, sync_error_rad_s_max=1e-6}";
@@ -470,7 +469,7 @@ mod tests {
         }
     }
 
-    /// Of ticks without a score, those that roles missed are granted to a share; not one whose samples were sent.
+    /// A share of ticks may be without a score because a role missed them, but not because sent samples were lost.
     #[test]
     fn a_metric_is_not_judged_by_ticks_that_were_not_scored() {
         let peak = "accept={peak_from_s=5, sync_error_rad_s_peak=1e-3, missed_ticks_max={}, starved_ticks_max={}}";
@@ -495,7 +494,7 @@ mod tests {
             (outcome.score.scored_ticks, outcome.score.unscored_ticks) = (9941, 60);
         };
         assert_eq!(judged(&[&stated], lose).0, Some(true));
-        // A tail that nothing came of is not scored either; what is above its limit is above it, whatever is missing.
+        // Ticks after the last sample are not scored either; an exceeded limit stays exceeded, whatever is missing.
         assert_eq!(judged(&[peak], |outcome| outcome.score.scored_ticks -= 100).0, None);
         let worse = |outcome: &mut Outcome| {
             (outcome.score.metrics[0].peak_blank, outcome.score.metrics[0].peak) = (4000, Some(0.6));

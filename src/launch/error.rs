@@ -1,4 +1,4 @@
-//! Why a run failed.
+//! The errors of a run.
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;
@@ -10,14 +10,14 @@ use crate::telemetry::{Grant, LedgerError};
 use std::io;
 use std::path::PathBuf;
 
-/// Why a run failed. Whatever had been started is gone.
+/// The error of a run. All its processes have ended, and its files are removed.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum LaunchError {
     /// The run cannot be stepped.
     #[error("the scenario cannot be stepped: {reason}; run it")]
     NotStepped {
-        /// Why.
+        /// The reason.
         reason: &'static str,
     },
     /// The scenario names cores that this process cannot be bound to.
@@ -27,7 +27,7 @@ pub enum LaunchError {
         /// The cores.
         cores: Vec<usize>,
     },
-    /// The domain could not be made.
+    /// The domain could not be created.
     #[error(transparent)]
     #[strum(transparent)]
     Domain(#[from] DomainError),
@@ -43,13 +43,13 @@ pub enum LaunchError {
     #[error(transparent)]
     #[strum(transparent)]
     Ledger(#[from] LedgerError),
-    /// There are too few descriptors. Found out later it would fail in the midst of the transport.
+    /// There are too few descriptors. The transport would fail with it later.
     #[error("the limit on open files is {limit} and this run may need {needed}; raise it with `ulimit -n {needed}`")]
     #[strum(serialize = "too-few-descriptors")]
     Descriptors {
         /// The limit.
         limit: u64,
-        /// What each process of the run may open.
+        /// The largest number of open files of a process of the run.
         needed: u64,
     },
     /// A file of the domain could not be written.
@@ -71,7 +71,7 @@ pub enum LaunchError {
         source: io::Error,
     },
     /// A role failed before the ticks ran.
-    #[error("{role} died: {cause}{}", if last_words.is_empty() { String::new() } else { format!("; it said: {last_words}") })]
+    #[error("{role} died: {cause}{}", if last_words.is_empty() { String::new() } else { format!("; its output ended with: {last_words}") })]
     #[strum(serialize = "role-died")]
     Died {
         /// The role.
@@ -105,7 +105,7 @@ pub enum LaunchError {
         /// The roles.
         roles: String,
     },
-    /// The recording could not be begun, or not be written where nobody else does.
+    /// The recording could not be started; in one thread also: not be written.
     #[error(transparent)]
     #[strum(transparent)]
     Record(#[from] RecordError),

@@ -1,4 +1,4 @@
-//! External roles that keep a run waiting: the role, the time, the missing samples, and what came instead.
+//! External roles for which a run waits: the role, the time, the missing sample and the one that came instead.
 //!
 //! Must not end a run; [`super::processes`] does. Must not blame a role whose own inputs are missing.
 
@@ -9,28 +9,27 @@ use crate::runtime::RoleId;
 use crate::sample::RoleState;
 use crate::scenario::Scenario;
 
-/// A role is named after it has kept the run waiting for so long, ns; then twice as late each time, up to the second.
+/// First and longest interval between two messages about a role for which the run waits, ns; the interval doubles each time.
 const FIRST_WORD_NS: u64 = 5_000_000_000;
 const WORD_INTERVAL_NS: u64 = 60_000_000_000;
-/// Once the ticks run, an external role without counters may keep the run waiting for so long where the scenario sets no limit,
-/// s: it may send the wrong samples.
+/// Default timeout of an external role without counters while the ticks run, s: it may send wrong samples.
 const TICKS_LIMIT_S: f64 = 30.0;
-/// The least limit in real time, periods.
+/// Shortest timeout in real time, periods.
 const LIMIT_PERIODS: f64 = 10.0;
-/// The most that one check adds to a wait, ns: a launcher that was stopped must not blame a role.
+/// Longest time that one check adds to a wait, ns: a paused launcher must not blame a role.
 const LOOK_MAX_NS: u64 = 100_000_000;
 
-/// The time for which each role of a run has been waited for.
+/// The time for which a run has waited for each of its roles.
 pub(super) struct ExternalWatch {
     waits: Vec<Wait>,
 }
 
-/// A role that keeps the run waiting.
+/// A role for which the run waits.
 #[derive(Debug, PartialEq)]
 pub(super) enum Waiting {
-    /// It is to be named, in these words.
-    Say(String),
-    /// It has used up its time, for this cause.
+    /// The line to print.
+    Print(String),
+    /// Its timeout has passed, for this cause.
     TooLong { member: usize, tick: u64, cause: String },
 }
 
@@ -69,7 +68,7 @@ impl ExternalWatch {
         Self { waits: (0..members).map(|_| Wait::default()).collect() }
     }
 
-    /// Looks at external roles that have not reached `state`, before the ticks run.
+    /// Checks the external roles that have not reached `state`, before the ticks run.
     pub fn before_ticks(
         &mut self,
         scenario: &Scenario,
@@ -82,25 +81,25 @@ impl ExternalWatch {
         self.look(members, limit_s, lack, now_ns)
     }
 
-    /// Looks at external roles whose samples are waited for; `scored_tick` is the scorer's next.
+    /// Checks the external roles whose samples others wait for; `scored_tick` is the scorer's next.
     pub fn in_ticks(&mut self, scenario: &Scenario, members: &[Member], scored_tick: u64, now_ns: u64) -> Vec<Waiting> {
         let realtime = scenario.clock == ClockKind::Realtime;
         let least_s = if realtime { LIMIT_PERIODS * scenario.tick_s() } else { 0.0 };
-        // One that counts its ticks sends the right ones: if it is alive, it needs time.
+        // A role with counters sends the right ticks: while it is alive, it needs time.
         let limit_s = |member: &Member| match scenario.external_timeout_s {
             Some(limit_s) => limit_s.max(least_s),
             None if member.counts() && !realtime => f64::INFINITY,
             None => TICKS_LIMIT_S.max(least_s),
         };
-        // Nothing is known of what other external roles wait for.
+        // The inputs that other external roles wait for are unknown.
         let next_tick = |role: RoleId| {
-            let own = members.iter().find(|member| member.books().any(|(of, _)| of == role))?;
+            let own = members.iter().find(|member| member.books().any(|(member_role, _)| member_role == role))?;
             (!own.external && own.state() == RoleState::Running).then_some(own.last.stamp.tick)
         };
         let scored = (scored_tick <= scenario.last_tick && !realtime).then_some(scored_tick);
         let others_done = members.iter().all(|member| member.external || member.state() == RoleState::Done);
         let lack = |member: &Member| {
-            // One that missed its last ticks has no sample more to send.
+            // A role that missed its last ticks has no further sample to send.
             let unfinished = others_done && member.state() < RoleState::Done && !member.spent();
             let state = unfinished.then_some(Lack::State(member.state()));
             member.trace()?.lack(next_tick, scored, realtime).or(state)
@@ -129,14 +128,17 @@ impl ExternalWatch {
             let waited_s = wait.look(lack, now_ns) as f64 / 1e9;
             let limit_s = limit_s(member);
             if waited_s >= limit_s {
-                let cause = format!("it kept the run waiting for {limit_s} s: {lack}");
+                let cause = format!("the run waited {limit_s} s for it: {lack}");
                 found.push(Waiting::TooLong {
                     member: index,
                     tick: lack.tick().unwrap_or(member.last.stamp.tick),
                     cause,
                 });
             } else if wait.word_due() {
-                found.push(Waiting::Say(format!("waiting for {} (external) for {waited_s:.0} s: {lack}", member.name)));
+                found.push(Waiting::Print(format!(
+                    "waiting for {} (external) for {waited_s:.0} s: {lack}",
+                    member.name
+                )));
             }
         }
         found
@@ -161,7 +163,7 @@ mod tests {
         assert!(!wait.word_due());
     }
 
-    /// A stop of the launcher is not a stop of the role.
+    /// A pause of the launcher does not count as a wait for the role.
     #[test]
     fn time_in_which_nobody_looked_does_not_count() {
         let mut wait = Wait::default();

@@ -1,7 +1,7 @@
 //! A run in one thread: the same roles over links in memory, or without links where nothing disturbs them. No iceoryx2, no
 //! files, no clock.
 
-use super::incident::{Action, Failure, Incident, Incidents};
+use super::incident::{Action, Incident, Incidents, RoleFailure};
 use super::{Launch, LaunchError, Outcome, Progress};
 use crate::bus::memory::MemoryBus;
 use crate::clock::Grid;
@@ -20,14 +20,14 @@ use std::sync::atomic::Ordering;
 
 /// Runs all roles of a scenario in turn.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
-    // A panic comes again in the node of a role, which is told by name then.
+    // After a panic the nodes repeat the run, and the role that panics is known.
     match panics::catch_quietly(|| run_directly(scenario, launch)) {
         Ok(Some(outcome)) => Ok(outcome),
         Ok(None) | Err(_) => run_nodes(scenario, launch),
     }
 }
 
-/// The same without links; none where it has to be done with them.
+/// Runs all roles without links; `None` if the run needs links.
 fn run_directly(scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome> {
     if launch.record.is_some() {
         return None;
@@ -54,7 +54,7 @@ fn run_directly(scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome>
     })
 }
 
-/// The same over links, whatever happens.
+/// Runs all roles over links.
 fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
     let bus = MemoryBus::new(depths(scenario));
     let scorer = RefCell::new(open_scorer(scenario, &bus)?);
@@ -71,7 +71,7 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
             return Ok(None);
         }
         let mut successor = node(&seats[index])?;
-        // Memory of one's own is always open.
+        // Private memory can always be opened.
         if successor.restore().is_ok() {
             successor.start(Grid { epoch_ns: 0, period_ns: scenario.period_ns }, tick)?;
         }
@@ -102,12 +102,13 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
         Ok(ended) => ended?,
         Err(panic) => {
             let Some(index) = turn.get() else { return Err(LaunchError::Panicked { panic }) };
-            // All commit what they count. One that cannot even do that has panicked in its own turn.
+            // All commit their counters. A role that fails at this has panicked in its own turn.
             for node in &mut nodes {
                 panics::catch(|| node.finish()).unwrap_or(Ok(()))?;
             }
             let (role, ledger) = &seats[index];
-            let incident = Incident::without_process(role.name(scenario), ledger, Failure::of(panic), Action::Stopped);
+            let incident =
+                Incident::without_process(role.name(scenario), ledger, RoleFailure::from_panic(panic), Action::Stopped);
             incidents.add(incident, &mut |id, tick| scorer.borrow_mut().incident(id, tick));
             Ended::Stopped
         }
@@ -120,7 +121,7 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
     let reports: Vec<RoleReport> =
         seats.iter().map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new())).collect();
     let recording = recorder.map(|mut recorder| {
-        // What was sent after the last look, if the run was stopped in the midst of a tick.
+        // The samples that were sent after the last look, if the run was stopped during a tick.
         let last = if unrecorded.is_none() { recorder.poll().err() } else { unrecorded };
         recorder.finish(&reports, last.as_ref())
     });
@@ -139,15 +140,15 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
     })
 }
 
-/// A role was killed by the scenario: what is done about it, by the policy that processes have.
+/// Reacts to a role that the scenario killed, by the same policy as for processes.
 fn incident(scenario: &Scenario, (role, ledger): &(RoleId, Ledger)) -> Incident {
     let (name, supervision) = (role.name(scenario), &scenario.supervision);
     let again = supervision.reaction_to(name) == OnFailure::Restart && ledger.generation() <= supervision.restarts_max;
-    let killed = Failure::new("scripted-kill", "it was killed by the scenario".to_owned(), String::new());
+    let killed = RoleFailure::new("scripted-kill", "it was killed by the scenario".to_owned(), String::new());
     Incident::without_process(name, ledger, killed, if again { Action::Restarted } else { Action::Stopped })
 }
 
-/// Now and then tells how far the run is; false if a signal asked for its end.
+/// Reports the progress at intervals. Returns false if a signal asked for the end.
 #[inline]
 pub(super) fn proceed(latest: impl FnOnce() -> f64, scenario: &Scenario, launch: &mut Launch<'_>, tick: u64) -> bool {
     if !tick.is_multiple_of(TURN_TICKS) {
@@ -173,30 +174,30 @@ mod tests {
         }
     }
 
-    /// Reports, hashes, counters, scores: everything is as the nodes make it, also of a run that was stopped, and where a guard
-    /// refuses anything there is no direct run.
+    /// Reports, hashes, counters and scores are those of the nodes, also of a stopped run. If a guard rejects a sample, there is no
+    /// direct run.
     #[test]
     fn a_direct_run_is_what_the_nodes_make_of_it() {
         let mut direct = 0;
         for (name, text) in SHIPPED {
             for (overrides, signal) in [(&[][..], 0), (&["duration_s=0.9", "accept={}"], 0), (&["accept={}"], 15)] {
                 let overrides: Vec<String> =
-                    ["clock=in-process"].iter().chain(overrides).map(|one| (*one).to_owned()).collect();
+                    ["clock=in-process"].iter().chain(overrides).map(|text| (*text).to_owned()).collect();
                 // Some scenarios have faults or limits that a shorter run does not have room for.
                 let Ok(scenario) = Scenario::parse(text, name, &overrides) else {
                     continue;
                 };
-                if let Some(told) = outcome(&scenario, true, signal) {
+                if let Some(by_roles) = outcome(&scenario, true, signal) {
                     direct += 1;
                     let by_nodes = outcome(&scenario, false, signal).unwrap();
-                    assert_eq!(format!("{told:?}"), format!("{by_nodes:?}"), "{name} {overrides:?}");
+                    assert_eq!(format!("{by_roles:?}"), format!("{by_nodes:?}"), "{name} {overrides:?}");
                 }
             }
         }
         assert!(direct >= 15, "{direct} of the shipped scenarios' runs were direct");
     }
 
-    /// A follower whose sensors say the same for too long.
+    /// A follower whose measurements repeat for too long.
     #[test]
     fn where_a_sample_is_not_believed_the_nodes_run() {
         let still = ["leader.initial_rate_rad_s=[0.0, 0.0, 0.8]", "follower.0.initial_rate_rad_s=[0.0, 0.0, 0.8]"];

@@ -1,4 +1,4 @@
-//! An incident: a role that failed while the ticks ran, and what the launcher did. Must not decide what is done.
+//! An incident: a role that failed while the ticks ran, and the launcher's reaction. Must not decide about the reaction.
 
 use crate::panics::Panic;
 use crate::telemetry::{Ledger, Outage};
@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt;
 
-/// A role that failed while the ticks ran, and what was done.
+/// A role that failed while the ticks ran, and the reaction.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Incident {
     /// The number within the run, from 1; recoveries refer to it.
@@ -14,14 +14,14 @@ pub struct Incident {
     pub id: u64,
     /// The role.
     pub role: String,
-    /// True if the role is another program, whose death cannot be seen.
+    /// True if the role is another program, whose end the launcher cannot see.
     pub external: bool,
     /// Other roles in the same process, which failed with it.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub with: Vec<String>,
     /// The role's generation.
     pub generation: u64,
-    /// The tick that it had not finished.
+    /// The first tick that it did not finish.
     pub tick: u64,
     /// The time of that tick, s from the first one.
     #[serde(default)]
@@ -33,47 +33,47 @@ pub struct Incident {
     pub cause: String,
     /// The end of its error output.
     pub last_words: String,
-    /// The panic that ended its process, if one did: its message as it was written, and its place.
+    /// The panic that ended its process, if one did: its message and its place.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub panic: Option<Panic>,
-    /// True if it panicked as before, so that another start would not help.
+    /// True if it panicked as before, so that a restart would not help.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub repeated: bool,
-    /// True if its successor begins with its counters alone: the inherited state may be what it died of.
+    /// True if its successor inherits the counters only: the inherited state may have caused the failure.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub begins_anew: bool,
-    /// The program that took its seat, if one did.
+    /// The program that replaced it, if one did.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub replaced_by: Option<Replacement>,
     /// The launcher's action.
     pub action: Action,
-    /// The time from when it was noticed until its successor ran, s.
+    /// The time from the noticed failure until the successor ran, s.
     pub outage_s: Option<f64>,
-    /// The time from `tick` on until every metric with a limit was within it and stayed there, s. None if that did not happen,
+    /// The time from `tick` on until every metric with a limit was within it and stayed there, s. `None` if that did not happen,
     /// or if there is no limit.
     pub recovery_s: Option<f64>,
 }
 
-/// A program that took the seat of another one.
+/// A program that replaced another one in an external role.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Replacement {
-    /// Its process, by the number that it knows itself by.
+    /// Its process identifier, as the program itself sees it.
     pub pid: u32,
     /// The tick of its first sample.
     pub tick: u64,
 }
 
-/// What is done about a role that failed.
+/// The reaction to a failed role.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Action {
-    /// It was started anew.
+    /// The role was restarted.
     Restarted,
     /// The run was ended in order.
     Stopped,
-    /// Nothing: it died after its last tick, and its results are complete.
+    /// None: it died after its last tick, and its results are complete.
     Noted,
-    /// Nothing: the run went on without it, and with it again once it was back.
+    /// None: the run went on while the role was absent.
     Continued,
 }
 
@@ -99,12 +99,12 @@ impl fmt::Display for Incident {
         };
         write!(f, "{}{with} {failed} at tick {}: {}", self.role, self.tick, self.cause)?;
         if !self.last_words.is_empty() {
-            write!(f, "; it said: {}", self.last_words)?;
+            write!(f, "; its output ended with: {}", self.last_words)?;
         }
         let end = match self.action {
-            Action::Restarted if self.begins_anew => "; it is started anew, without the state that it had inherited",
-            Action::Restarted => "; it is started anew",
-            Action::Stopped if self.repeated => "; as before, so it is not started anew; the run ends",
+            Action::Restarted if self.begins_anew => "; it is restarted without the inherited state",
+            Action::Restarted => "; it is restarted",
+            Action::Stopped if self.repeated => "; a restart would fail in the same way; the run ends",
             Action::Stopped => "; the run ends",
             Action::Noted => " after its last tick; its results are complete",
             Action::Continued => "; the run goes on",
@@ -114,8 +114,8 @@ impl fmt::Display for Incident {
 }
 
 impl Incident {
-    /// An incident of a role of the first generation with a process of its own.
-    pub(super) fn new(role: String, tick: u64, failure: Failure, action: Action) -> Self {
+    /// Creates an incident of a role of the first generation with a process of its own.
+    pub(super) fn new(role: String, tick: u64, failure: RoleFailure, action: Action) -> Self {
         Self {
             id: 0,
             role,
@@ -137,9 +137,9 @@ impl Incident {
         }
     }
 
-    /// An absence of the device in a role's seat.
-    pub(super) fn of_device(role: &str, outage: &Outage) -> Self {
-        let failure = Failure::new(outage.code.clone(), outage.cause.clone(), String::new());
+    /// Creates an incident of a device that was absent.
+    pub(super) fn from_outage(role: &str, outage: &Outage) -> Self {
+        let failure = RoleFailure::new(outage.code.clone(), outage.cause.clone(), String::new());
         Self {
             external: true,
             outage_s: outage.back_at_tick.map(|_| outage.seconds),
@@ -147,8 +147,8 @@ impl Incident {
         }
     }
 
-    /// The end of a role that has no process of its own: after a scripted one its successor is there at once.
-    pub(super) fn without_process(role: &str, ledger: &Ledger, failure: Failure, action: Action) -> Self {
+    /// Creates an incident of a role without a process of its own. After a scripted end its successor starts at once.
+    pub(super) fn without_process(role: &str, ledger: &Ledger, failure: RoleFailure, action: Action) -> Self {
         let tick = crate::runtime::next_tick(ledger);
         Self { generation: ledger.generation(), ..Self::new(role.to_owned(), tick, failure, action) }
     }
@@ -159,7 +159,7 @@ impl Incident {
 pub(super) struct Incidents(Vec<Incident>);
 
 impl Incidents {
-    /// Keeps an incident, and passes its number and its tick on.
+    /// Adds an incident, and passes its number and its tick to `note`.
     pub fn add(&mut self, incident: Incident, note: &mut dyn FnMut(u64, u64)) -> &Incident {
         let id = self.0.len() as u64 + 1;
         note(id, incident.tick);
@@ -167,12 +167,12 @@ impl Incidents {
         &self.0[self.0.len() - 1]
     }
 
-    /// Returns true if an incident is known, whatever its number.
+    /// Returns true if an equal incident is known, apart from its number.
     pub fn contains(&self, incident: &Incident) -> bool {
         self.0.iter().any(|known| *known == Incident { id: known.id, ..incident.clone() })
     }
 
-    /// Ends the outage of a role after so long, s.
+    /// Sets the outage of a role, s.
     pub fn end_outage(&mut self, role: &str, outage_s: f64) {
         let last = self.0.iter_mut().rev().find(|incident| incident.role == role);
         last.into_iter().for_each(|incident| incident.outage_s = Some(outage_s));
@@ -187,7 +187,7 @@ impl Incidents {
 }
 
 /// The failure of a role.
-pub(super) struct Failure {
+pub(super) struct RoleFailure {
     /// The stable name of the cause.
     pub code: String,
     pub cause: String,
@@ -196,14 +196,14 @@ pub(super) struct Failure {
     pub panic: Option<Panic>,
 }
 
-impl Failure {
-    /// A failure of a process that did not panic.
+impl RoleFailure {
+    /// Creates the failure of a process that did not panic.
     pub fn new(code: impl Into<String>, cause: String, last_words: String) -> Self {
         Self { code: code.into(), cause, last_words, panic: None }
     }
 
-    /// A panic. Of the error output, which ends with a backtrace, it keeps the message alone.
-    pub fn of(panic: Panic) -> Self {
+    /// Creates a failure by a panic. The error output, which ends with a backtrace, is left out.
+    pub fn from_panic(panic: Panic) -> Self {
         Self { panic: Some(panic.clone()), ..Self::new("panicked", panic.to_string(), String::new()) }
     }
 }

@@ -1,9 +1,9 @@
-//! The janitor: a process that puts away what dead processes left in a run's domain, and removes the domain if the launcher
-//! is killed.
+//! The janitor: a process that removes the files of dead processes from a run's domain, and the domain if the launcher is
+//! killed.
 //!
-//! The transport's clean-up may take long, and never ends while a file's maker is stopped. So the launcher does not wait: it
-//! asks by a byte, polls for the answer, and replaces a janitor that does not answer in time. Must not
-//! touch what belongs to live processes.
+//! The transport's clean-up may take long, and never ends while the creator of a file is stopped. So the launcher does not
+//! wait: it requests a clean-up by a byte, polls for the answer, and replaces a janitor that does not answer in time. Must not
+//! touch files of live processes.
 
 use super::LaunchError;
 use crate::bus::domain::{self, Domain};
@@ -20,26 +20,26 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Stdio};
 use std::time::{Duration, SystemTime};
 
-/// The launcher asks for what the dead left to be put away; so is answered when it is done.
+/// The request for a clean-up, and its answer.
 const CLEAR: u8 = b'c';
-/// The time without an answer after which a janitor is replaced, ns. A clean-up takes some 5 ms per dead process.
+/// Time without an answer after which a janitor is replaced, ns. A clean-up takes some 5 ms per dead process.
 const ANSWER_NS: u64 = 2_000_000_000;
 /// The number of janitors that are tried in a row for one request.
 const ATTEMPTS: u32 = 3;
 /// The interval between two checks for unfinished files and new processes.
 const LOOK: Duration = Duration::from_millis(50);
-/// A directory's time of change is so coarse at the most: what changed just before a look is looked at again.
+/// Coarsest resolution of a directory's time of change: a directory that changed just before a look is read again.
 const GRAIN: Duration = Duration::from_millis(100);
 
-/// The janitor, seen from the launcher.
+/// The launcher's handle on the janitor.
 pub(super) struct Janitor {
     root: PathBuf,
     limit: Duration,
     process: Process,
-    /// Requests without an answer, and since when the oldest waits, ns.
+    /// Number of requests without an answer, and time of the oldest, ns.
     pending: u64,
     since_ns: u64,
-    /// Janitors that have been tried for them.
+    /// Number of janitors that were tried for them.
     attempts: u32,
 }
 
@@ -51,7 +51,7 @@ struct Process {
 }
 
 impl Janitor {
-    /// Starts the janitor of a domain. A file that its maker does not finish for `limit` is taken for abandoned.
+    /// Starts the janitor of a domain. A file that its creator does not finish for `limit` counts as abandoned.
     pub fn start(domain: &Domain, limit: Duration) -> Result<Self, LaunchError> {
         let root = domain.root().to_owned();
         let process =
@@ -59,12 +59,12 @@ impl Janitor {
         Ok(Self { root, limit, process, pending: 0, since_ns: 0, attempts: 0 })
     }
 
-    /// The domain's directory.
+    /// Returns the domain's directory.
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// Asks for what dead processes left to be put away.
+    /// Requests the removal of the files of dead processes.
     pub fn clear_dead(&mut self) {
         if self.pending == 0 {
             (self.since_ns, self.attempts) = (monotonic_ns(), 1);
@@ -101,7 +101,7 @@ impl Janitor {
         (self.pending > 0).then(|| self.process.answers.as_fd())
     }
 
-    /// Starts another one in its place, and asks that one.
+    /// Replaces the janitor, and repeats the request.
     fn replace(&mut self, how: &str) {
         let started = (self.attempts < ATTEMPTS).then(|| Process::start(&self.root, self.limit));
         match started {
@@ -114,7 +114,7 @@ impl Janitor {
                 self.attempts = attempts;
             }
             Some(Err(_)) | None => {
-                tell(format_args!("corotate: the janitor {how}; what a dead process left may keep its successor out"));
+                tell(format_args!("corotate: the janitor {how}; files of a dead process may prevent its restart"));
                 self.pending = 0;
             }
         }
@@ -141,7 +141,7 @@ impl Process {
     }
 }
 
-/// The domain is gone. The janitor is killed, not asked to end: it may be stopped, and the launcher does not wait for it.
+/// Kills the janitor once the domain is removed: it may be stopped, and the launcher does not wait for it.
 impl Drop for Janitor {
     fn drop(&mut self) {
         self.process.kill();
@@ -152,12 +152,11 @@ fn timespec(duration: Duration) -> Timespec {
     Timespec { tv_sec: duration.as_secs() as i64, tv_nsec: duration.subsec_nanos() as _ }
 }
 
-/// The janitor's work in a domain: removes unfinished files, puts away what the dead left when `line` asks for it or
-/// a process joins, and answers. At the end of `line` the launcher is dead: removes what is left of this domain and of every other
-/// whose launcher is dead.
+/// Runs the janitor in a domain: removes unfinished files, and the files of dead processes when `line` requests it or a process
+/// joins. The end of `line` means that the launcher is dead: then it removes this domain and every other one whose launcher is dead.
 ///
 /// # Errors
-/// The system's reason for not starting a thread.
+/// The system's error if a thread cannot start.
 pub fn janitor(
     domain: &Domain,
     limit: Duration,
@@ -187,8 +186,7 @@ pub fn janitor(
         // No process is left to which a failure could be reported.
         let _ = answers.write_all(requests).and_then(|()| answers.flush());
     }
-    // Roles whose launcher was killed are dying at this moment: what they still hold, or were just about to make, goes in a
-    // later round.
+    // Roles whose launcher was killed end now: files that they still hold, or were about to create, are removed in a later round.
     let mut gone = Vec::new();
     for pause_ms in [0, 50, 500] {
         std::thread::sleep(Duration::from_millis(pause_ms));
@@ -198,13 +196,13 @@ pub fn janitor(
     Ok(())
 }
 
-/// Removes unfinished files of a domain, for ever.
+/// Removes unfinished files of a domain, in an endless loop.
 fn sweep(domain: &Domain, limit: Duration) {
     let mut files = Watched::new(domain::SHARED_MEMORY.into());
     let mut services = Watched::new(domain.root().join("services"));
     let mut unfinished = false;
     loop {
-        // Not short-circuited: each look remembers what it saw.
+        // Not short-circuited: each look stores its result.
         if files.changed() | services.changed() | unfinished {
             unfinished = domain.remove_unfinished(limit);
         }
@@ -212,10 +210,10 @@ fn sweep(domain: &Domain, limit: Duration) {
     }
 }
 
-/// A directory in which files come and go.
+/// A directory whose files change.
 struct Watched {
     path: PathBuf,
-    /// The time of its latest change that was seen.
+    /// The time of its latest known change.
     seen: Option<SystemTime>,
 }
 
@@ -224,7 +222,7 @@ impl Watched {
         Self { path, seen: None }
     }
 
-    /// Returns true if a file may have come or gone since the last check.
+    /// Returns true if its files may have changed since the last check.
     fn changed(&mut self) -> bool {
         let now = SystemTime::now();
         let Ok(changed) = fs::metadata(&self.path).as_ref().map(Metadata::modified) else { return false };

@@ -1,7 +1,7 @@
 //! The part of a host that joined a run: starts its roles, supervises them, and ends them when the run ends or its heartbeats
 //! stop.
 //!
-//! Leads nothing: phases, epoch and credit are the word of the host that launched. Must not score, nor record.
+//! Phases, epoch and credit come from the host that launched. Must not score, nor record.
 
 use super::children::END_LIMIT;
 use super::incident::Incident;
@@ -22,12 +22,12 @@ use crate::system::tell;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-/// Between two looks at the roles, ns.
+/// Interval between two looks at the roles, ns.
 const LOOK_NS: u64 = 10_000_000;
-/// Between two looks at the word when there is none, ns: in real time, and in lockstep.
+/// Interval between two looks at the schedule while none comes, ns: in real time, and in lockstep.
 const LULL_NS: u64 = 1_000_000;
 const LOCKSTEP_LULL_NS: u64 = 50_000;
-/// The time that the relay may take to report the host's end, ns: longer than it tries.
+/// Time that the relay may take to report the host's end, ns: longer than it tries.
 const TELL_NS: u64 = 25_000_000_000;
 
 /// The end of a host's part in a run.
@@ -57,7 +57,7 @@ pub fn join(
     prepare(scenario, launch, domain)?;
     let path = clock_path(domain);
     let failed = |source| LaunchError::Write { path: path.clone(), source };
-    // Made here, so that every process of this host finds it before it publishes anything.
+    // Created here, so that it exists before any process of this host publishes.
     RunClock::open(&path).map_err(failed)?;
     let startup_limit = Duration::from_secs_f64(scenario.startup_timeout_s);
     let mut janitor = super::janitor::Janitor::start(domain, startup_limit)?;
@@ -70,7 +70,7 @@ pub fn join(
     while !relay.ready()? {
         if launch.signal.load(Ordering::Relaxed) != 0 {
             return Ok(FarOutcome {
-                failed: Some("it was ended by a signal".to_owned()),
+                failed: Some("a signal ended it".to_owned()),
                 incidents: Vec::new(),
                 ticks: (0, 0),
             });
@@ -86,7 +86,7 @@ pub fn join(
     Ok(FarOutcome { failed: far_end.failed, incidents: far_end.incidents, ticks })
 }
 
-/// Ends the roles, and leaves their final reports and that of this process for the relay.
+/// Ends the roles, and writes their final reports and that of this process for the relay.
 fn end(
     mut supervisor: Supervisor<'_>,
     failed: Option<String>,
@@ -101,14 +101,12 @@ fn end(
     }
     let ticks = shutdown.reports.iter().map(|report| report.ticks);
     let ticks = ticks.fold((0, 0), |(executed, missed), ticks| (executed + ticks.executed, missed + ticks.missed));
-    let problems = shutdown
-        .problems
-        .into_iter()
-        .chain(shutdown.unbooked.into_iter().map(|role| format!("{role} left no account")));
+    let problems =
+        shutdown.problems.into_iter().chain(shutdown.unbooked.into_iter().map(|role| format!("{role} left no report")));
     let (incidents, mut relay) = supervisor.dismiss();
     let far_end = FarEnd { failed, incidents, problems: problems.collect() };
     let path = far_end_path(domain.root(), host);
-    let text = serde_json::to_vec(&far_end).expect("an account of plain values is JSON");
+    let text = serde_json::to_vec(&far_end).expect("a report of plain values is JSON");
     write_whole(&path, &text).map_err(|source| LaunchError::Write { path, source })?;
     let limit_ns = raw_ns() + TELL_NS;
     while relay.companion.lingers() && raw_ns() < limit_ns {
@@ -117,7 +115,7 @@ fn end(
     Ok((far_end, ticks))
 }
 
-/// Follows the word of the host that launched.
+/// Follows the schedule of the host that launched.
 struct Follower<'a> {
     scenario: &'a Scenario,
     hub: &'a str,
@@ -126,7 +124,7 @@ struct Follower<'a> {
 }
 
 impl Follower<'_> {
-    /// Takes the word, if there is a new one.
+    /// Reads the schedule, if there is a new one.
     fn hear(&mut self, supervisor: &mut Supervisor<'_>) -> Result<bool, BusError> {
         let mut news = false;
         while self.word.advance()? {
@@ -158,16 +156,16 @@ impl Follower<'_> {
                 supervisor.listen()?;
                 let signal = launch.signal.load(Ordering::Relaxed);
                 if signal != 0 {
-                    return Ok(Some(format!("it was ended by signal {signal}")));
+                    return Ok(Some(format!("signal {signal} ended it")));
                 }
-                // A stop of this process is not a silence of the other host.
+                // A pause of this process does not count as silence of the other host.
                 let looked_ns = raw_ns();
                 if looked_ns - std::mem::replace(&mut told_ns, looked_ns) > 20 * LOOK_NS {
                     self.heard_ns = looked_ns;
                 }
                 let limit_s = self.scenario.host_silence_s(supervisor.phase() >= Phase::Run);
                 if (looked_ns.saturating_sub(self.heard_ns)) as f64 > limit_s * 1e9 {
-                    return Ok(Some(format!("nothing was heard of the host {} for {limit_s} s", self.hub)));
+                    return Ok(Some(format!("no heartbeat from the host {} for {limit_s} s", self.hub)));
                 }
                 if supervisor.phase() == Phase::Stop {
                     return Ok(None);

@@ -1,6 +1,6 @@
-//! A run's verdict as JUnit XML, for whoever collects test results: one suite per run, one case per criterion.
+//! A run's verdict as JUnit XML, for tools that collect test results: one suite per run, one case per criterion.
 //!
-//! Must not be more lenient than the exit code, nor ever be without a case: what did not run is an error.
+//! Must not be more lenient than the exit code, and always has a case: a run that did not begin is an error.
 
 use super::{Action, Criterion, Summary, exact};
 use crate::config::RunId;
@@ -9,13 +9,13 @@ use std::io;
 
 type Xml = Writer<Vec<u8>>;
 
-/// What became of a case.
+/// The result of a case.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Verdict {
     Passed,
-    /// The loop did not do what the scenario asks for.
+    /// The loop does not meet the scenario's criteria.
     Failed(String),
-    /// The run itself went wrong.
+    /// The run itself failed.
     Error(String),
     Skipped(String),
 }
@@ -25,7 +25,7 @@ struct Case {
     verdict: Verdict,
 }
 
-/// The verdict on a run of the scenario of that name: its summary, or why there is none.
+/// Writes the verdict on a run of the named scenario: its summary, or the reason for its absence.
 pub fn junit(scenario: &str, run: RunId, ended: Result<&Summary, &str>) -> String {
     let mut xml = Writer::new_with_indent(Vec::new(), b' ', 2);
     write(&mut xml, scenario, run, ended).expect("memory takes every text");
@@ -58,11 +58,11 @@ fn write(xml: &mut Xml, scenario: &str, run: RunId, ended: Result<&Summary, &str
     Ok(())
 }
 
-/// What tells this run from another one of the same scenario, and where samples were rejected.
+/// Returns the properties that identify the run, and the numbers of rejected samples.
 fn properties(xml: &mut Xml, run: RunId, summary: Option<&Summary>) -> io::Result<()> {
     let mut properties = vec![("run".to_owned(), run.to_string())];
     if let Some(summary) = summary {
-        let told = [
+        let facts = [
             ("verdict", summary.verdict.clone()),
             ("clock", summary.clock.to_owned()),
             ("tick_hz", summary.tick_hz.to_string()),
@@ -72,10 +72,10 @@ fn properties(xml: &mut Xml, run: RunId, summary: Option<&Summary>) -> io::Resul
             ("version", summary.version.to_owned()),
             ("revision", summary.revision.to_owned()),
         ];
-        properties.extend(told.map(|(name, value)| (name.to_owned(), value)));
-        for (signal, told) in &summary.score.statuses {
+        properties.extend(facts.map(|(name, value)| (name.to_owned(), value)));
+        for (signal, statuses) in &summary.score.statuses {
             let ticks = |(name, ticks): (&String, &u64)| (format!("ticks {name} of {signal}"), ticks.to_string());
-            properties.extend(told.iter().map(ticks));
+            properties.extend(statuses.iter().map(ticks));
         }
         let rejected = summary.books.links.iter().filter(|link| link.rejected > 0);
         properties.extend(rejected.map(|link| {
@@ -91,7 +91,7 @@ fn properties(xml: &mut Xml, run: RunId, summary: Option<&Summary>) -> io::Resul
     Ok(())
 }
 
-/// The run, its counters, and the criteria in their order.
+/// Returns the cases: the run, its counters, and the criteria in their order.
 fn cases(summary: &Summary) -> Vec<Case> {
     let stopped = summary.incidents.iter().find(|incident| incident.action == Action::Stopped);
     let run = match (stopped, summary.signal) {
@@ -142,7 +142,7 @@ impl Case {
     }
 }
 
-/// A text with what XML cannot hold replaced: a role's last words may be anything.
+/// Returns a text without the characters that XML does not allow: a role's output may be anything.
 fn printable(text: &str) -> String {
     let held = |c: char| matches!(c, '\t' | '\n' | ' '..='\u{d7ff}' | '\u{e000}'..='\u{fffd}' | '\u{10000}'..);
     text.chars().map(|c| if held(c) { c } else { char::REPLACEMENT_CHARACTER }).collect()
@@ -171,7 +171,7 @@ mod tests {
         assert!(matches!(judge(&criterion(None, None)), Verdict::Skipped(_)));
     }
 
-    /// Whatever a dying role says, the file can be read, by a parser that is not the writer's.
+    /// Another parser reads the file, whatever a failing role prints.
     #[test]
     fn a_run_that_failed_is_one_error_whatever_its_reason_holds() {
         let reason = "follower died: \u{1b}[31m<oops> & \"gone\"\0\u{ffff}\nline 2 ]]> é";

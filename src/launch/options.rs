@@ -1,34 +1,34 @@
-//! What the caller of a run gives, and what it is told meanwhile.
+//! The options of a run, and its progress reports.
 
 use crate::hosts::HostEndpoint;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicUsize;
 
-/// What a run needs besides its scenario.
+/// The options of a run besides its scenario.
 pub struct Launch<'a> {
-    /// Roles that somebody else starts, besides the scenario's own.
+    /// External roles, besides those of the scenario.
     pub external: Vec<String>,
-    /// The file to record every sample to.
+    /// The file for the recording.
     pub record: Option<PathBuf>,
-    /// The directory that its results will be written to, by its whole path: whoever looks for the run finds it by that.
+    /// The absolute path of the directory for its results, by which other programs find the run.
     pub results: Option<PathBuf>,
-    /// Where to show the run on a Foxglove WebSocket; not in one thread, and only by a program that was built with it.
+    /// The address of a Foxglove WebSocket server; not in one thread, and only with the feature `foxglove`.
     pub foxglove: Option<SocketAddr>,
-    /// This host's part in a run over several, which others join; without it all roles run here.
+    /// This host's endpoint in a run over several hosts; without it all roles run here.
     pub host: Option<HostEndpoint>,
-    /// Refuse to run without every privilege that was asked for.
+    /// Refuse to run unless every requested privilege is granted.
     pub require_realtime: bool,
-    /// Whether the hash is kept of the ticks on the way too, by which two runs are compared; a run in one thread may do without.
+    /// True if the hash has checkpoints, by which two runs are compared; a run in one thread may go without.
     pub checkpoints: bool,
     /// The signal that asked the run to end; 0 while none has.
     pub signal: &'a AtomicUsize,
-    /// Called now and then.
+    /// Called with the progress at intervals.
     pub progress: &'a mut dyn FnMut(&Progress<'_>),
 }
 
 impl<'a> Launch<'a> {
-    /// What a run needs at the least, to be added to by whoever wants more. Roles are processes of this program: its `main` is
+    /// Creates the minimal options. Roles are processes of this program: its `main` must be
     /// [`Program::main`](crate::Program::main).
     pub fn new(signal: &'a AtomicUsize, progress: &'a mut dyn FnMut(&Progress<'_>)) -> Self {
         Self {
@@ -45,25 +45,25 @@ impl<'a> Launch<'a> {
     }
 }
 
-/// How far a run is.
+/// The progress of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Progress<'a> {
-    /// Waits for roles; these are started by somebody else, in this domain.
+    /// The run waits for roles.
     Waiting {
         /// Roles that are not ready.
         roles: Vec<&'a str>,
         /// External roles among them.
         external: Vec<&'a str>,
-        /// Other hosts among whose roles some of them are, once these can be joined with.
+        /// Other hosts that have such roles, once they can join.
         hosts: Vec<&'a str>,
-        /// The domain's directory; it holds a file with the seat of each external role.
+        /// The domain's directory, with the seat description of each external role.
         domain: PathBuf,
     },
-    /// A role keeps the run waiting, or goes on: a line to print, now and then.
+    /// A line about a role for which the run waits, or that goes on.
     External(&'a str),
-    /// Ticks run.
+    /// The ticks run.
     Running {
-        /// The last tick scored.
+        /// The last scored tick.
         tick: u64,
         /// The last tick of the run.
         last_tick: u64,

@@ -1,6 +1,6 @@
-//! What a run left: the roles' reports, the counters that are drawn from them, hash, latencies.
+//! The outcome of a run: the roles' reports, the counters computed from them, state hash, latencies.
 //!
-//! Must not soften anything: what was not measured is said to be so, and counters that do not balance are a failure.
+//! Must not hide anything: a missing measurement is reported as missing, and counters that do not balance are a failure.
 
 use super::Score;
 use super::incident::Incident;
@@ -15,62 +15,62 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// Everything that a run left in memory.
+/// The outcome of a run in memory.
 #[derive(Debug)]
 pub struct Outcome {
-    /// The roles' own accounts, in the order of a tick.
+    /// The roles' reports, in the order of a tick.
     pub reports: Vec<RoleReport>,
     /// External roles that keep no counters.
     pub unbooked: Vec<String>,
-    /// What is wrong with accounts that were left.
+    /// Defects of the reports.
     pub problems: Vec<String>,
     /// The score.
     pub score: Score,
     /// Roles that failed while the ticks ran.
     pub incidents: Vec<Incident>,
-    /// What hosts tell of their part, if there are several.
+    /// The hosts' reports, if there are several hosts.
     pub hosts: Vec<HostStatistics>,
     /// The launcher's own privileges.
     pub grants: Vec<Grant>,
-    /// What was recorded, if that was asked for.
+    /// The recording, if there is one.
     pub recording: Option<RecordingReport>,
     /// The domain that was used, if there was one.
     pub domain: Option<PathBuf>,
-    /// The signal that ended the run before its time, or 0.
+    /// The signal that ended the run early, or 0.
     pub signal: usize,
-    /// What is still to be removed of the run, if it had processes: that goes when this is dropped.
-    #[expect(dead_code, reason = "held for what its end does")]
+    /// The files that the processes of the run left; dropping this removes them.
+    #[expect(dead_code, reason = "held for its destructor")]
     pub(super) remains: Option<Remains>,
 }
 
 /// The counters of a run.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct Accounting {
-    /// Whether they balance.
+    /// True if they balance.
     pub balanced: bool,
-    /// Where they do not.
+    /// The imbalances.
     pub problems: Vec<String>,
-    /// External roles that keep no counters: nothing is known of their ticks, nor of the links that they write and read.
+    /// External roles without counters: their ticks, and the links that they write and read, are unknown.
     pub unbooked: Vec<String>,
     /// Per role.
     pub roles: BTreeMap<String, Ticks>,
     /// Per reading end.
     pub links: Vec<LinkCounters>,
-    /// Per external role that keeps no counters: ticks of which its readers had no sample.
+    /// Per external role without counters: ticks for which its readers had no sample.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub absent_ticks: BTreeMap<String, u64>,
     /// Ticks missed or starved, all roles together.
     pub missed_ticks: u64,
-    /// Samples received and not believed, all links together.
+    /// Samples received and rejected, all links together.
     pub rejected_samples: u64,
     /// Samples received and rejected, by reason.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub rejected_by: BTreeMap<String, u64>,
-    /// Samples that scripted faults touched, and stalls.
+    /// Samples that scripted faults changed, and stalls.
     pub injected_faults: u64,
 }
 
-/// One reading end beside its writing end. Of a writer that keeps no counters nothing is known but what its reader met.
+/// The counters of a link: its reading end, and its writing end if the writer keeps counters.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct LinkCounters {
     /// The service.
@@ -81,36 +81,36 @@ pub struct LinkCounters {
     pub published: Option<u64>,
     /// Samples received.
     pub received: u64,
-    /// Ticks for which the writer sent none.
+    /// Ticks for which the writer sent no sample.
     pub skipped: Option<u64>,
-    /// Ticks for which the reader received none, up to its last.
+    /// Ticks for which the reader received no sample, up to its last one.
     pub gaps: u64,
     /// Sent after the reader's last look.
     pub unread: Option<u64>,
-    /// Ticks for which the writer sent a void, and voids received.
+    /// No-sample markers sent, and received.
     pub void: (Option<u64>, u64),
     /// Samples that were not newer than the one before.
     pub stale: u64,
-    /// Samples received and not believed.
+    /// Samples received and rejected.
     pub rejected: u64,
     /// Samples received and rejected, by reason.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub rejected_by: BTreeMap<String, u64>,
-    /// Samples that scripted faults touched on the writing end.
+    /// Samples that scripted faults changed at the writing end.
     pub injected: Option<u64>,
 }
 
 /// The state hash of a run, comparable between clocks.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct State {
-    /// The hash over everything that was published.
+    /// The hash over all published samples.
     pub hash: String,
-    /// How many ticks the run came to: those that every role with counters executed or missed.
+    /// Number of ticks that every role with counters executed or missed.
     pub elapsed_ticks: u64,
     /// The first tick whose samples may differ from an undisturbed run's, if any.
     pub first_disturbed_tick: Option<u64>,
-    /// How many ticks from the first on are covered by `clean_hash`: all that are undisturbed, or up to the last checkpoint
-    /// among them. Runs of more than 16 384 ticks have one every 2nd, 3rd, … tick.
+    /// Number of ticks from the first on that `clean_hash` covers: all undisturbed ones, up to the last checkpoint among them.
+    /// Runs of more than 16 384 ticks have a checkpoint at every 2nd, 3rd, … tick.
     pub clean_ticks: u64,
     /// The hash over those ticks.
     pub clean_hash: String,
@@ -136,22 +136,22 @@ pub struct StageFigures {
 }
 
 impl State {
-    /// How far the hash covers the run, in words, where no tick is known to be disturbed.
+    /// Describes the part of the run that the hash covers, if no tick is known to be disturbed.
     pub(crate) fn undisturbed_words(elapsed_ticks: u64, all_ticks: u64, unbooked: bool) -> String {
         match (elapsed_ticks < all_ticks, unbooked) {
             (true, _) => format!("the run ended after {elapsed_ticks} of {all_ticks} ticks"),
-            (false, true) => "every tick of the roles that keep books undisturbed".to_owned(),
+            (false, true) => "every tick of the roles with counters undisturbed".to_owned(),
             (false, false) => "every tick undisturbed".to_owned(),
         }
     }
 }
 
-/// The hash over everything that was published, as a summary has it.
+/// Returns the state hash of a run.
 pub(crate) fn state_hash(reports: &[RoleReport]) -> String {
     format!("{:016x}", combine(hashes(reports).iter().map(|(_, hash)| hash.last)))
 }
 
-/// The hashes of all signals, in the order of their names.
+/// Returns the hashes of all signals, in the order of their names.
 fn hashes(reports: &[RoleReport]) -> Vec<(&String, &Checkpoints)> {
     let written = reports.iter().flat_map(|report| &report.written);
     let mut links: Vec<_> = written.filter_map(|link| Some((&link.service, link.hash.as_ref()?))).collect();
@@ -172,7 +172,7 @@ impl Accounting {
         }
         for (_, link) in &written {
             if !link.balances() {
-                problems.push(format!("{}: published and skipped do not add up", link.service));
+                problems.push(format!("{}: published and skipped samples do not add up", link.service));
             }
         }
         if !interrupted {
@@ -181,7 +181,7 @@ impl Accounting {
         let mut links = Vec::new();
         for (report, read) in reports.iter().flat_map(|report| report.read.iter().map(move |read| (report, read))) {
             let written = written.iter().find(|(_, written)| written.service == read.service);
-            // A role that died may have sent a sample that it had no time to count: whoever received it knows.
+            // A role that died may have sent a sample that it did not count: its reader counted it.
             let in_flight =
                 written.is_some_and(|(writer, written)| lost.contains(writer) && read.last_tick > written.last_tick);
             let written = written.map(|(_, written)| *written);
@@ -194,7 +194,7 @@ impl Accounting {
         let elapsed = reports.iter().map(|report| report.ticks.elapsed).max().unwrap_or(0);
         let absent_ticks = outcome.unbooked.iter().filter_map(|role| {
             let came = links_of(scenario, role, &links).map(|link| link.received + link.void.1).min()?;
-            // A reader need not have looked for the last sample, nor for commands that act after the end.
+            // A reader may not have read the last sample, nor commands that act after the end.
             Some((role.clone(), elapsed.saturating_sub(came + scenario.actuation_delay_ticks)))
         });
         Self {
@@ -213,7 +213,7 @@ impl Accounting {
     }
 }
 
-/// The reading ends of what a role sends.
+/// Returns the reading ends of a role's signals.
 pub(super) fn links_of<'a>(
     scenario: &Scenario,
     role: &str,
@@ -253,7 +253,7 @@ impl LinkCounters {
         let lossless = scenario.clock != ClockKind::Realtime;
         let balanced = read.balances(lossless) && written.is_none_or(|written| read.agrees(written, in_flight));
         if !balanced {
-            let writer = written.map_or("its writer keeps no books".to_owned(), |written| {
+            let writer = written.map_or("its writer has no counters".to_owned(), |written| {
                 format!("{} published, {} extra, {} void", written.published, written.extra, written.void)
             });
             problems.push(format!(
@@ -277,7 +277,7 @@ impl State {
         let hash = combine(links.iter().map(|(_, hash)| hash.last));
         let mut elapsed = books.roles.values().map(|ticks| ticks.elapsed);
         let elapsed_ticks = elapsed.clone().min().unwrap_or(0);
-        // The end is seldom a multiple of the stride. It is one moment only if all came as far.
+        // The end is seldom a multiple of the stride. The hash covers it only if all signals reached it.
         let covered = checkpoints.last().map_or(0, |(ticks, _)| *ticks);
         if first_disturbed_tick.is_none() && covered < elapsed_ticks && elapsed.all(|ticks| ticks == elapsed_ticks) {
             checkpoints.push((elapsed_ticks, hash));
@@ -296,7 +296,7 @@ impl State {
     }
 }
 
-/// How long roles that failed were out, and how long the loop took to recover from it, by role.
+/// Returns the outages of failed roles, and the recovery times of the loop, by role.
 pub(super) fn incident_figures(incidents: &[Incident]) -> Vec<StageFigures> {
     let mut stages: BTreeMap<(&str, &str), Latency> = BTreeMap::new();
     for incident in incidents {
@@ -321,7 +321,7 @@ pub(super) fn latencies(scenario: &Scenario, reports: &[RoleReport]) -> Vec<Stag
     let figures = |report: &RoleReport, stage: &crate::telemetry::StageReport| {
         let (latency, role, stage) = (stage.latency(), report.role.clone(), stage.stage.clone());
         let figures = latency.percentiles();
-        // An age begins at the leader, a hop at who sent the input; all else is measured by one clock.
+        // An age begins at the leader, a hop at the sender of the input; other stages use one clock.
         let sender = if stage == "hop" && role == "controller" { RoleId::Observer } else { RoleId::Plant(0) };
         let stamps_of = (!figures.are_shown()).then(|| sender.name(scenario).to_owned());
         StageFigures { role, stage, stamps_of, figures, latency }

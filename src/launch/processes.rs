@@ -1,6 +1,6 @@
-//! A run as processes: gather, warm up, run, stop, collect. One thread, which also scores.
+//! A run as processes: start, warm up, run, stop, collect. One thread, which also scores.
 //!
-//! Whatever happens, dropping what this file holds ends every role, removes the domain and ends the janitor, in that order.
+//! On every path the destructors of this file end every role, remove the domain and end the janitor, in that order.
 
 #[cfg(feature = "hosts")]
 mod joined;
@@ -9,7 +9,7 @@ use super::children::{END_LIMIT, RoleProcess};
 use super::companion::Companion;
 use super::external::{ExternalWatch, Waiting};
 use super::foxglove;
-use super::incident::{Action, Failure, Incident, Incidents};
+use super::incident::{Action, Incident, Incidents, RoleFailure};
 use super::janitor::Janitor;
 use super::recorder::RecorderWatch;
 use super::relay::RelayWatch;
@@ -42,34 +42,34 @@ use std::os::unix::ffi::OsStrExt;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-/// Between two looks at the roles, ns.
+/// Interval between two looks at the roles, ns.
 const LOOK_NS: u64 = 1_000_000;
-/// In real time, between two looks at the samples to be scored, ns.
+/// Interval between two looks at the samples to be scored, in real time, ns.
 const SCORE_NS: u64 = 10_000_000;
-/// From the word to run to the first tick, ns: time for every role to hear it, here and on other hosts.
+/// Time from the published start to the first tick, ns: every role, here and on other hosts, must receive it before.
 const EPOCH_LEAD_NS: u64 = 20_000_000;
 const EPOCH_LEAD_HOSTS_NS: u64 = 300_000_000;
-/// In lockstep, between two looks at samples when there are none, ns.
+/// Interval between two looks at samples in lockstep while no sample comes, ns.
 const LULL_NS: u64 = 50_000;
-/// Upper bounds on the files that the process which opens most of them, the launcher, has open.
+/// Upper bounds on the number of open files of the launcher, which opens more than any other process.
 const DESCRIPTORS: u64 = 32;
 const DESCRIPTORS_PER_ROLE: u64 = 24;
-/// Upper bounds on the files that a run makes in shared memory, and beside it: signals, connections, tags of processes.
+/// Upper bounds on the number of files that a run creates in shared memory and beside it: signals, connections, process tags.
 const FILES: u64 = 32;
 const FILES_PER_ROLE: u64 = 32;
-/// A role runs in its debugger for so long before the ticks begin, ns: between attaching and stopping it runs for a moment.
+/// Time for which a role must run in its debugger before the ticks begin, ns: a debugger attaches a moment before it stops it.
 const DEBUGGED_NS: u64 = 500_000_000;
-/// Between two looks whether a role that is to end is stopped, ns.
+/// Interval between two checks if a role that is to end is stopped, ns.
 const RELEASE_NS: u64 = 50_000_000;
-/// The time that an external role of this host has to leave a run that a signal ends: it may hang.
+/// Time that an external role of this host has to end after a signal ended the run: it may hang.
 const SIGNALLED_END_LIMIT: Duration = Duration::from_millis(300);
-/// Without any progress for so long the run counts as hung, ns, and periods.
+/// Time without progress after which the run counts as hung, ns and periods.
 const HUNG_NS: u64 = 30_000_000_000;
 const HUNG_PERIODS: u64 = 10;
 
 /// Runs all roles of a scenario as processes.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
-    // What it starts has them too.
+    // Child processes inherit them.
     request_short_slices();
     let owned = new_domain(scenario)?;
     let domain = owned.domain();
@@ -85,21 +85,21 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let mut scorer = open_scorer(scenario, &bus).map_err(|error| supervisor.blame(error.into()))?;
     let signal = supervisor.run_phases(&mut *scorer, launch, &grants).map_err(|error| supervisor.blame(error))?;
     let mut shutdown = supervisor.shut_down(if signal == 0 { END_LIMIT } else { SIGNALLED_END_LIMIT });
-    let of = |report: &RoleReport| {
+    let role_outages = |report: &RoleReport| {
         let role = report.role.clone();
         report.outages.clone().into_iter().map(move |outage| (role.clone(), outage))
     };
-    let outages: Vec<(String, Outage)> = shutdown.reports.iter().flat_map(of).collect();
+    let outages: Vec<(String, Outage)> = shutdown.reports.iter().flat_map(role_outages).collect();
     shutdown.leave_out_partial(|role| is_external(scenario, launch, role));
     let ShutdownReport { reports, unbooked, mut problems } = shutdown;
-    let (hosts, told, elsewhere) = supervisor.relay.finish(&supervisor.incidents);
-    problems.extend(told);
+    let (hosts, host_problems, elsewhere) = supervisor.relay.finish(&supervisor.incidents);
+    problems.extend(host_problems);
     let mut note = |id, tick| scorer.incident(id, tick);
     for incident in elsewhere {
         supervisor.incidents.add(incident, &mut note);
     }
     for (role, outage) in outages {
-        let incident = supervisor.incidents.add(Incident::of_device(&role, &outage), &mut note);
+        let incident = supervisor.incidents.add(Incident::from_outage(&role, &outage), &mut note);
         tell(format_args!("corotate: {incident}"));
     }
     let score = scorer.finish()?;
@@ -110,14 +110,14 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     Ok(Outcome { reports, unbooked, problems, score, incidents, hosts, grants, recording, domain, signal, remains })
 }
 
-/// A domain with room for a run of a scenario.
+/// Creates a domain with the shared memory that a run of a scenario needs.
 pub fn new_domain(scenario: &Scenario) -> Result<OwnedDomain, LaunchError> {
     require_descriptors(scenario)?;
     require_files(FILES + FILES_PER_ROLE * RoleId::all(scenario).len() as u64)?;
     Ok(OwnedDomain::create(shared_memory_bytes(scenario))?)
 }
 
-/// Leaves in a domain what whoever joins a run there must know.
+/// Writes the files into a domain that a process needs to join the run.
 pub(super) fn prepare(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain) -> Result<(), LaunchError> {
     let path = scenario_path(domain);
     write_whole(&path, scenario.to_file().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
@@ -132,13 +132,13 @@ fn is_external(scenario: &Scenario, launch: &Launch<'_>, role: &str) -> bool {
     launch.external.iter().chain(&scenario.external).any(|external| external == role)
 }
 
-/// The other host that has a role, if one takes part and has.
+/// Returns the other host that runs a role, if one does.
 fn elsewhere<'s>(scenario: &'s Scenario, launch: &Launch<'_>, role: &str) -> Option<&'s str> {
     let seat = launch.host.as_ref()?;
     scenario.hosts.host_of(role).filter(|host| *host != seat.host)
 }
 
-/// Leaves the seat of every external role in the domain, for the program that is to take it.
+/// Writes the seat description of every external role into the domain.
 fn describe_seats(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain) -> Result<(), LaunchError> {
     let roles = RoleId::all(scenario).into_iter();
     for role in roles.filter(|role| is_external(scenario, launch, role.name(scenario))) {
@@ -155,13 +155,13 @@ pub(super) struct ShutdownReport {
     pub reports: Vec<RoleReport>,
     /// External roles that keep no counters.
     pub unbooked: Vec<String>,
-    /// What is wrong with what was left.
+    /// Defects of the reports.
     pub problems: Vec<String>,
 }
 
 impl ShutdownReport {
-    /// Leaves out the account of an external role that covers less than others have read of it: that of a program which took
-    /// the seat after another, and knows nothing of that one.
+    /// Removes the report of an external role that covers fewer ticks than others have read from it: a program that replaced
+    /// another one knows nothing of that one's ticks.
     fn leave_out_partial(&mut self, is_external: impl Fn(&str) -> bool) {
         let last_read = |service: &str| {
             let links = self.reports.iter().flat_map(|report| &report.read);
@@ -174,13 +174,13 @@ impl ShutdownReport {
         self.unbooked.extend(names);
     }
 
-    /// Takes in what a role has left.
+    /// Adds a role's report, or its counters.
     fn gather(&mut self, scenario: &Scenario, domain: &Domain, role: RoleId, ledger: &Ledger) {
         let name = role.name(scenario).to_owned();
         let file = std::fs::read(report_path(domain.root(), &name)).ok();
         match file.map(|bytes| serde_json::from_slice(&bytes)) {
             Some(Ok(report)) => self.reports.push(report),
-            Some(Err(error)) => self.problems.push(format!("{name}: its report is none: {error}")),
+            Some(Err(error)) => self.problems.push(format!("{name}: its report is unreadable: {error}")),
             None if ledger.generation() > 0 => {
                 self.reports.push(report(scenario, role, ledger, Vec::new(), Vec::new()));
             }
@@ -189,17 +189,17 @@ impl ShutdownReport {
     }
 }
 
-/// Raises the limit on open files as far as it goes, for this process and its children, and checks that it is enough.
+/// Raises the limit on open files as far as allowed, for this process and its children, and checks that it is enough.
 fn require_descriptors(scenario: &Scenario) -> Result<(), LaunchError> {
     let limits = getrlimit(Resource::Nofile);
-    // What cannot be raised is judged as it is.
+    // If it cannot be raised, the present limit is checked.
     let _ = setrlimit(Resource::Nofile, Rlimit { current: limits.maximum, ..limits });
     let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
     let needed = DESCRIPTORS + DESCRIPTORS_PER_ROLE * RoleId::all(scenario).len() as u64;
     if limit < needed { Err(LaunchError::Descriptors { limit, needed }) } else { Ok(()) }
 }
 
-/// All roles of a run, and the launcher's line to them.
+/// All roles of a run, and the launcher's link to them.
 pub(super) struct Supervisor<'a> {
     scenario: &'a Scenario,
     domain: &'a Domain,
@@ -227,7 +227,7 @@ impl<'a> Supervisor<'a> {
         let foxglove = foxglove::start(launch.foxglove, domain)?;
         let hub = launch.host.as_ref().map_or("", |seat| &seat.host);
         let relay = RelayWatch::start(launch.host.as_ref(), hub, scenario, domain)?;
-        // All of them first: they come up while their links are opened here.
+        // All roles start first: they prepare while their links are opened here.
         let start = |role: RoleId| {
             let name = role.name(scenario);
             match is_external(scenario, launch, name) || elsewhere(scenario, launch, name).is_some() {
@@ -257,7 +257,7 @@ impl<'a> Supervisor<'a> {
         blame(error, members.chain([self.recorder.companion.process(), self.relay.companion.process()]))
     }
 
-    /// Leads the roles through the phases of a run. Returns the signal that ended it, or 0.
+    /// Runs the phases of a run with all roles. Returns the signal that ended it, or 0.
     fn run_phases(
         &mut self,
         scorer: &mut dyn Scorer,
@@ -307,7 +307,7 @@ impl<'a> Supervisor<'a> {
             self.listen()?;
             scorer.poll(u64::MAX)?;
             self.look_at_standstills(launch);
-            self.require_well()?;
+            self.require_all_alive()?;
             if launch.signal.load(Ordering::Relaxed) != 0 {
                 return Ok(false);
             }
@@ -321,7 +321,7 @@ impl<'a> Supervisor<'a> {
         Ok(true)
     }
 
-    /// Tells of roles that are stopped or go on; true while the run waits for one.
+    /// Reports roles that are stopped or go on. Returns true while the run waits for one.
     fn look_at_standstills(&mut self, launch: &mut Launch<'_>) -> bool {
         let now_ns = monotonic_ns();
         for line in self.members.iter_mut().filter_map(|member| member.look_at_standstill(now_ns)) {
@@ -330,18 +330,18 @@ impl<'a> Supervisor<'a> {
         self.members.iter().any(Member::is_stopped)
     }
 
-    /// An error if a role has failed before the ticks run.
-    fn require_well(&mut self) -> Result<(), LaunchError> {
+    /// Returns an error if a role has failed before the ticks run.
+    fn require_all_alive(&mut self) -> Result<(), LaunchError> {
         for member in &mut self.members {
-            if let Some(Failure { cause, last_words, .. }) = member.failure(self.scenario, self.janitor) {
+            if let Some(RoleFailure { cause, last_words, .. }) = member.failure(self.scenario, self.janitor) {
                 return Err(LaunchError::Died { role: member.name.clone(), cause, last_words });
             }
         }
         Ok(())
     }
 
-    /// Waits until every role has reached a state; false if a signal came first. A role that fails on the way will not do
-    /// better the next time.
+    /// Waits until every role has reached a state; returns false if a signal came first. A role that fails before is not
+    /// restarted, because the failure would only repeat.
     fn await_state(
         &mut self,
         state: RoleState,
@@ -354,13 +354,13 @@ impl<'a> Supervisor<'a> {
         loop {
             self.announce()?;
             self.listen()?;
-            // Time in which a role is stopped does not count.
+            // The time for which a role is stopped does not count.
             let stopped = self.look_at_standstills(launch);
             end_ns += if stopped { monotonic_ns() - looked_ns } else { 0 };
             looked_ns = monotonic_ns();
             // Its links take part in the warm-up.
             scorer.poll(u64::MAX)?;
-            self.require_well()?;
+            self.require_all_alive()?;
             let waiting = self.externals.before_ticks(self.scenario, &self.members, state, monotonic_ns());
             if !self.tell(waiting, scorer, launch) {
                 return Ok(false);
@@ -390,24 +390,24 @@ impl<'a> Supervisor<'a> {
             hosts.sort_unstable();
             hosts.dedup();
             roles.extend(absent);
-            // Whoever starts a role by hand, or joins with a host, may take all the time in the world.
+            // Roles that are started by hand, and hosts that join, have no timeout.
             if monotonic_ns() > end_ns && external.is_empty() && hosts.is_empty() {
                 return Err(LaunchError::StartUp { limit_s, roles: roles.join(", ") });
             }
-            // Where they join is known once somebody listens there.
+            // The address for them is known once the relay listens.
             let hosts = if self.relay.ready()? { hosts } else { Vec::new() };
             (launch.progress)(&Progress::Waiting { roles, external, hosts, domain: self.domain.root().to_owned() });
             self.pause(monotonic_ns() + LOOK_NS);
         }
     }
 
-    /// Follows the ticks to the end: scores, gives credit, watches over the roles.
+    /// Follows the ticks to the end: scores, grants credit, supervises the roles.
     fn follow(&mut self, scorer: &mut dyn Scorer, launch: &mut Launch<'_>) -> Result<usize, LaunchError> {
         let lockstep = self.scenario.clock != ClockKind::Realtime;
         let credit_ticks = (window_ticks(self.scenario) / 4).max(1);
         let mut stall = Stall::new(self.scenario);
         let mut backoff = Backoff::default();
-        let (mut next_look_ns, mut somebody_ended) = (0, false);
+        let (mut next_look_ns, mut process_ended) = (0, false);
         while self.members.iter().any(|member| member.state() < RoleState::Done) {
             let scored = scorer.poll(credit_ticks)?;
             let credit = if lockstep { self.recorder.credit(scorer.next_tick(), self.word.credit_tick)? } else { 0 };
@@ -415,14 +415,14 @@ impl<'a> Supervisor<'a> {
                 backoff = Backoff::default();
             }
             let idle = scored == 0 && !(lockstep && backoff.brief());
-            // A word wakes who is far ahead: for several ticks, unless there is nothing else to do.
+            // Publishing wakes the roles that are far ahead: for several ticks at once, unless there is nothing else to do.
             if credit >= self.word.credit_tick + if idle { 1 } else { credit_ticks } {
                 self.word.credit_tick = credit;
                 self.announce()?;
             }
             let now_ns = monotonic_ns();
-            if now_ns >= next_look_ns || somebody_ended {
-                somebody_ended = false;
+            if now_ns >= next_look_ns || process_ended {
+                process_ended = false;
                 next_look_ns = now_ns + SCORE_NS;
                 self.announce()?;
                 self.listen()?;
@@ -431,7 +431,7 @@ impl<'a> Supervisor<'a> {
                     return Ok(0);
                 }
                 let stopped = self.look_at_standstills(launch);
-                // No other role is blamed for what a stopped one keeps waiting.
+                // While a role is stopped, no other one is blamed for waiting.
                 let waiting = match stopped {
                     true => Vec::new(),
                     false => self.externals.in_ticks(self.scenario, &self.members, scorer.next_tick(), now_ns),
@@ -439,7 +439,7 @@ impl<'a> Supervisor<'a> {
                 if !self.tell(waiting, scorer, launch) {
                     return Ok(0);
                 }
-                // An external role that is waited for has its own limit.
+                // The wait for an external role has its own timeout.
                 stall.look(&self.members, now_ns, stopped || lockstep && self.externals.waits())?;
                 let signal = launch.signal.load(Ordering::Relaxed);
                 if signal != 0 {
@@ -450,14 +450,14 @@ impl<'a> Supervisor<'a> {
             }
             if idle {
                 let until_ns = if lockstep { monotonic_ns() + LULL_NS } else { next_look_ns };
-                somebody_ended = self.pause(until_ns);
+                process_ended = self.pause(until_ns);
             }
         }
         Ok(0)
     }
 
-    /// Notices roles that have failed and brings them back, and hosts that left; returns false if the run is to end for that.
-    /// `note` gets the number and the tick of each incident; `tick` is the one at hand.
+    /// Restarts roles that have failed, and records hosts that left; returns false if the run must end. `note` receives the number
+    /// and the tick of each incident; `tick` is the current one.
     pub fn supervise(&mut self, note: &mut dyn FnMut(u64, u64), tick: u64, now_ns: u64) -> Result<bool, LaunchError> {
         let mut go_on = true;
         for incident in self.relay.supervise(self.scenario, tick) {
@@ -483,7 +483,7 @@ impl<'a> Supervisor<'a> {
             if let Some(incident) = member.replaced() {
                 tell(format_args!("corotate: {}", self.incidents.add(incident, note)));
             }
-            // A successor finds its links free once the remains of its predecessor are put away.
+            // A successor can open its links once the files of its predecessor are removed.
             if !self.janitor.is_busy() {
                 member.restart(self.scenario, self.domain, now_ns)?;
             }
@@ -494,14 +494,14 @@ impl<'a> Supervisor<'a> {
         Ok(go_on)
     }
 
-    /// Tells which external roles keep the run waiting; false if the run is to end for one.
+    /// Reports the external roles for which the run waits. Returns false if the run must end for one.
     fn tell(&mut self, waiting: Vec<Waiting>, scorer: &mut dyn Scorer, launch: &mut Launch<'_>) -> bool {
         let mut go_on = true;
         for waiting in waiting {
             match waiting {
-                Waiting::Say(words) => (launch.progress)(&Progress::External(&words)),
+                Waiting::Print(words) => (launch.progress)(&Progress::External(&words)),
                 Waiting::TooLong { member, tick, cause } => {
-                    let failure = Failure::new("waited-too-long", cause, String::new());
+                    let failure = RoleFailure::new("waited-too-long", cause, String::new());
                     let incident = self.members[member].fail(failure, self.scenario, monotonic_ns());
                     let incident = Incident { tick, ..incident };
                     let incident = self.incidents.add(incident, &mut |id, tick| scorer.incident(id, tick));
@@ -513,7 +513,7 @@ impl<'a> Supervisor<'a> {
         go_on
     }
 
-    /// Waits until `until_ns`, or until a role's process ends or the janitor answers: then it is true.
+    /// Waits until `until_ns`. Returns true if a role's process ended or the janitor answered before.
     pub fn pause(&self, until_ns: u64) -> bool {
         let handles = self.members.iter().filter_map(|member| member.process.as_ref()?.handle()).map(AsFd::as_fd);
         let handles = handles.chain(self.janitor.answers());
@@ -521,11 +521,11 @@ impl<'a> Supervisor<'a> {
             handles.map(|handle| PollFd::from_borrowed_fd(handle, PollFlags::IN)).collect();
         let wait_ns = until_ns.saturating_sub(monotonic_ns());
         let timeout = Timespec { tv_sec: (wait_ns / 1_000_000_000) as i64, tv_nsec: (wait_ns % 1_000_000_000) as _ };
-        // Woken early or not, the caller looks for itself.
+        // The caller checks all conditions itself after every wake-up.
         poll(&mut handles, Some(&timeout)).is_ok_and(|ended| ended > 0)
     }
 
-    /// Says the launcher's word again.
+    /// Publishes the schedule again.
     pub fn announce(&mut self) -> Result<(), BusError> {
         self.word.stamp =
             Stamp { tick: self.word.stamp.tick + 1, generation: 1, origin_ns: 0, sent_ns: monotonic_ns() };
@@ -533,7 +533,7 @@ impl<'a> Supervisor<'a> {
         self.schedule.send(|sample| *sample = word)
     }
 
-    /// Hears how the roles are.
+    /// Reads all heartbeats.
     pub fn listen(&mut self) -> Result<(), BusError> {
         let now_ns = monotonic_ns();
         self.recorder.listen()?;
@@ -549,8 +549,8 @@ impl<'a> Supervisor<'a> {
         LaunchError::Privileges { denied }
     }
 
-    /// Lets the roles go and gathers their reports. Of a role that leaves none, there are its counters, unless it was none of
-    /// ours. External roles of this host have `external_limit` to leave.
+    /// Ends the roles and collects their reports; a role of ours without a report has its counters. External roles of this host
+    /// have `external_limit` to end.
     pub fn shut_down(&mut self, external_limit: Duration) -> ShutdownReport {
         self.word.phase = Phase::Stop as u64;
         let [limit_ns, external_limit_ns] =
@@ -559,8 +559,7 @@ impl<'a> Supervisor<'a> {
             let limit_ns = if member.external_here() { external_limit_ns } else { limit_ns };
             member.lingers() && monotonic_ns() < limit_ns
         };
-        // Told first, and then nobody is waited for who is dead: an external role that was killed has left once its remains
-        // are put away.
+        // Published first. Dead roles are not waited for: a killed external role counts as ended once its files are removed.
         let _ = self.announce();
         self.janitor.clear_dead();
         let mut release_ns = monotonic_ns() + RELEASE_NS;
@@ -570,13 +569,13 @@ impl<'a> Supervisor<'a> {
                 release_ns = monotonic_ns() + RELEASE_NS;
             }
             let _ = self.janitor.is_busy();
-            // Again and again: who is only just coming up has not heard it yet. A link that fails now changes nothing:
-            // whoever does not end by itself is ended.
+            // Published repeatedly, because a role that is starting has not received it yet. A link that fails now changes
+            // nothing: a role that does not end is killed.
             let _ = self.announce();
             self.pause(monotonic_ns() + LOOK_NS);
         }
-        // Whoever takes samples stays until nobody sends any more; the recorder until its file is written, which a busy disk may
-        // hold up; the relay, as long as it waits for other hosts.
+        // Readers of samples end after all writers; the recorder once its file is written, which a busy disk may delay; the relay
+        // once no other host is missing.
         let begun_ns = monotonic_ns();
         let within = |limit_ns: u64| monotonic_ns() - begun_ns < limit_ns;
         while self.foxglove.lingers() && within(END_LIMIT.as_nanos() as u64)
@@ -593,14 +592,14 @@ impl<'a> Supervisor<'a> {
                     true => member.note(failure, self.scenario),
                     false => Incident { action: Action::Stopped, ..member.fail(failure, self.scenario, 0) },
                 };
-                // All ticks are over: there is nothing to recover from.
+                // All ticks are over, so no recovery is timed.
                 tell(format_args!("corotate: {}", self.incidents.add(incident, &mut |_, _| ())));
             }
             for (role, ledger) in member.books() {
                 shutdown.gather(self.scenario, self.domain, role, ledger);
             }
         }
-        // In the order of a tick, whoever shares a process with whom.
+        // In the order of a tick, whichever roles share a process.
         let order = RoleId::all(self.scenario);
         let place = |name: &str| order.iter().position(|role| role.name(self.scenario) == name);
         shutdown.reports.sort_by_key(|report| place(&report.role));
@@ -608,7 +607,8 @@ impl<'a> Supervisor<'a> {
     }
 }
 
-/// The cause of a link's failure, if a process died: one that dies while it opens its links leaves some half made.
+/// Returns the death of a process as the cause of a link's failure, if one died: a process that dies while it opens its links
+/// leaves incomplete ones.
 fn blame<'a>(
     error: LaunchError,
     processes: impl Iterator<Item = (&'a str, Option<&'a mut RoleProcess>)>,
@@ -624,7 +624,7 @@ fn blame<'a>(
     processes.filter_map(death).next().unwrap_or(error)
 }
 
-/// Notices that nothing moves any more.
+/// Detects a run without progress.
 struct Stall {
     limit_ns: u64,
     moved_ns: u64,
@@ -633,7 +633,7 @@ struct Stall {
 
 impl Stall {
     fn new(scenario: &Scenario) -> Self {
-        // Who falls silent is blamed first, by name and cause.
+        // A role's own timeout comes first, because it names the role.
         let heartbeat_ns = (2e9 * scenario.supervision.heartbeat_timeout_s) as u64;
         let limit_ns = HUNG_NS.max(HUNG_PERIODS * scenario.period_ns).max(heartbeat_ns);
         Self { limit_ns, moved_ns: monotonic_ns(), ticks: Vec::new() }
@@ -664,9 +664,8 @@ mod tests {
     use crate::config::SHIPPED;
     use std::process::Command;
 
-    /// Or a run would end for want of progress before it says of whom.
     #[test]
-    fn who_falls_silent_is_blamed_before_the_run_counts_as_hung() {
+    fn the_heartbeat_timeout_comes_before_that_of_a_run_without_progress() {
         let limit_s = |heartbeat_s: f64| {
             let patient = [format!("supervision.heartbeat_timeout_s={heartbeat_s:?}")];
             let scenario = Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &patient).unwrap();
@@ -675,9 +674,8 @@ mod tests {
         assert_eq!([2.0, 30.0, 3600.0].map(limit_s), [30.0, 60.0, 7200.0]);
     }
 
-    /// What a link says that a dead process left half made is no cause.
     #[test]
-    fn a_link_that_failed_is_blamed_on_the_process_that_died() {
+    fn the_cause_of_a_failed_link_is_the_process_that_died() {
         let error = || BusError::Open { service: "s".to_owned(), end: "reader", reason: "HangsInCreation".to_owned() };
         let start = |script: &str| {
             let mut command = Command::new("/bin/sh");

@@ -1,7 +1,7 @@
 //! The launcher's view of the recorder of a run: started beside the roles, or by the user while they run.
 //!
-//! In lockstep no role gets ahead of it, or of the scorer, by more than the window. Must not let a recorder that died, or is
-//! silent, hold the run up.
+//! In lockstep no role runs ahead of it, or of the scorer, by more than the window. Must not let a dead or silent recorder delay
+//! the run.
 
 use super::LaunchError;
 use super::companion::Companion;
@@ -20,13 +20,13 @@ use crate::telemetry::RoleReport;
 use std::path::Path;
 use std::process::Command;
 
-/// The most that one check adds to its silence, ns: a launcher that was stopped must not blame the recorder.
+/// Longest time that one check adds to its silence, ns: a paused launcher must not blame the recorder.
 const LOOK_MAX_NS: u64 = 100_000_000;
 
 /// A run's recorder, if it has one.
 pub(super) struct RecorderWatch {
     pub companion: Companion,
-    /// The name of the file, for a recorder of ours.
+    /// The name of the file, if the run started the recorder.
     file: Option<String>,
     health: <IoxBus as Bus>::Reader<Health>,
     last: Health,
@@ -39,7 +39,7 @@ pub(super) struct RecorderWatch {
 }
 
 impl RecorderWatch {
-    /// Starts a recorder to `file`; without a file, watches for one that the user starts.
+    /// Starts a recorder to `file`; without a file, expects one that the user may start.
     pub fn start(file: Option<&Path>, scenario: &Scenario, domain: &Domain, bus: &IoxBus) -> Result<Self, LaunchError> {
         let arguments = file.map(|file| {
             move |command: &mut Command| {
@@ -79,9 +79,8 @@ impl RecorderWatch {
         Ok(self.state() >= state)
     }
 
-    /// Returns the last tick that every required reader has seen, if it is `scored` without the recorder and the last
-    /// credit was `given`. One that joined late gets nothing from a writer that waits: there is credit for one tick more, of
-    /// which it gets everything.
+    /// Returns the last tick that every required reader has received; without the recorder it is `scored`, and the last credit was
+    /// `given`. A recorder that joined late receives nothing while the writers wait, so there is credit for one more tick.
     pub fn credit(&mut self, scored: u64, given: u64) -> Result<u64, BusError> {
         self.listen()?;
         if !self.active() {
@@ -94,7 +93,7 @@ impl RecorderWatch {
         }))
     }
 
-    /// Looks whether it has failed: then the run goes on without.
+    /// Checks if it has failed: then the run goes on without it.
     pub fn supervise(&mut self, janitor: &mut Janitor) {
         if self.problem.is_some() || self.state() == RoleState::Done {
             return;
@@ -105,7 +104,7 @@ impl RecorderWatch {
 
     /// Returns true while it writes: our process has not ended, or a recorder of the user has not reported its end.
     pub fn lingers(&mut self) -> bool {
-        // Nothing is lost but its last words if the link has failed.
+        // If the link has failed, only its last status is lost.
         let _ = self.listen();
         self.companion.lingers() || self.file.is_none() && self.active()
     }
@@ -123,7 +122,7 @@ impl RecorderWatch {
         let left = std::fs::read(report_path(domain.root(), RECORDER)).ok();
         let report = left.and_then(|bytes| serde_json::from_slice(&bytes).ok());
         let mut report: RecordingReport = report.unwrap_or_else(|| {
-            let how = if late { "it had not ended its file when it was ended" } else { "it left no report" };
+            let how = if late { "it had not completed its file in time and was killed" } else { "it left no report" };
             let problem = self.problem.unwrap_or_else(|| how.to_owned());
             let code = Some("recorder-lost".to_owned());
             let (messages, bytes, signals) = (0, 0, Vec::new());

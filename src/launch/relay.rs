@@ -5,7 +5,7 @@
 use super::LaunchError;
 use super::children::RoleProcess;
 use super::companion::Companion;
-use super::incident::{Action, Failure, Incident, Incidents};
+use super::incident::{Action, Incident, Incidents, RoleFailure};
 use crate::bus::domain::Domain;
 use crate::hosts::{HostEndpoint, HostStatistics, RELAY, far_end_path, ready_path, relay_report_path};
 use crate::runtime::RoleId;
@@ -14,14 +14,14 @@ use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::process::Command;
 
-/// The final account of a joined host's launcher for the launcher of the run.
+/// The final report of a joined host's launcher for the launcher of the run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct FarEnd {
     /// The reason for which the host gave up, if it did.
     pub failed: Option<String>,
     /// Roles that failed there, as incidents.
     pub incidents: Vec<Incident>,
-    /// External roles that keep no counters, and what is wrong with accounts that were left.
+    /// External roles that keep no counters, and defects of the reports.
     pub problems: Vec<String>,
 }
 
@@ -29,7 +29,7 @@ pub(super) struct FarEnd {
 pub(super) struct RelayWatch {
     pub companion: Companion,
     root: PathBuf,
-    /// All hosts, and whether it is known how each of the others ended.
+    /// All hosts; true for each whose end is known.
     hosts: Vec<(String, bool)>,
     /// True on the host that launched.
     leads: bool,
@@ -88,14 +88,14 @@ impl RelayWatch {
                     roles.next().unwrap_or_default(),
                     roles.collect(),
                     tick,
-                    Failure::new("host-left", cause, String::new()),
+                    RoleFailure::new("host-left", cause, String::new()),
                 )
             }));
         }
         incidents
     }
 
-    /// Returns the hosts' final reports: accounts, errors, and incidents that are not in `known`.
+    /// Returns the hosts' final reports, their problems, and incidents that are not in `known`.
     pub fn finish(&mut self, known: &Incidents) -> (Vec<HostStatistics>, Vec<String>, Vec<Incident>) {
         self.companion.process().1.map(RoleProcess::kill);
         let (mut reports, mut problems, mut incidents) = (Vec::new(), Vec::new(), Vec::new());
@@ -115,7 +115,7 @@ fn far_end(root: &std::path::Path, host: &str) -> Option<FarEnd> {
     serde_json::from_slice(&std::fs::read(far_end_path(root, host)).ok()?).ok()
 }
 
-/// An incident that ends a run for more than a role.
-fn incident(role: String, with: Vec<String>, tick: u64, failure: Failure) -> Incident {
+/// Creates an incident that ends a run because of more than one role.
+fn incident(role: String, with: Vec<String>, tick: u64, failure: RoleFailure) -> Incident {
     Incident { external: true, with, ..Incident::new(role, tick, failure, Action::Stopped) }
 }

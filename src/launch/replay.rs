@@ -1,4 +1,4 @@
-//! A recorded role replayed as a process: the very program that takes part in runs, in a domain of its own, fed in lockstep.
+//! Replays a recorded role as a process: the program that takes part in runs, in a domain of its own, fed in lockstep.
 //!
 //! One role at a time. Must not judge: [`crate::record`] selects the role's inputs and compares its outputs.
 
@@ -17,7 +17,7 @@ use crate::seat::{scenario_path, write_whole};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-/// Between two looks when nothing has come for a while, ns.
+/// Interval between two looks while nothing comes, ns.
 const LULL_NS: u64 = 50_000;
 /// The time without progress after which the role counts as hung, ns.
 const HUNG_NS: u64 = 30_000_000_000;
@@ -53,7 +53,7 @@ pub fn replay_as_process(
         script: &script,
         moved_ns: monotonic_ns(),
         next_word_ns: 0,
-        // Less than the links hold, and than the role may be ahead.
+        // Less than the links hold, and than the role's window.
         ahead_ticks: window_ticks(scenario) * 3 / 4,
     };
     prompter.lead()?;
@@ -61,10 +61,10 @@ pub fn replay_as_process(
     Ok(prompter.comparer.finish(&script, &script.steps, script.limit.clone()))
 }
 
-/// Leaves out, with a note, what a single process cannot repeat.
+/// Removes the steps, with a note, that a single process cannot repeat.
 fn cut(script: &mut Script, scenario: &Scenario) {
     let plant = matches!(script.role, RoleId::Plant(_));
-    // What a scripted fault took from it, that takes from it again.
+    // A scripted miss also happens in the replay.
     let (mut next, mut interruptions) = (0, Interruptions::for_role(scenario, &script.name, 1, 0));
     let broken = script.steps.iter().find_map(|step| {
         let missed = plant && (next..step.tick).any(|tick| !interruptions.misses(tick));
@@ -83,8 +83,8 @@ fn cut(script: &mut Script, scenario: &Scenario) {
     script.limit = first;
 }
 
-/// The scenario without what would hold up or kill the process: that has had its effect on the recording. Every role has
-/// a process of its own here.
+/// Returns the scenario without stalls and kills, whose effect is in the recording already. Every role has a process of its own
+/// here.
 fn without_interruptions(scenario: &Scenario) -> String {
     let mut table = scenario.resolved.clone();
     if let Some(launch) = table.get_mut("launch").and_then(toml::Value::as_table_mut) {
@@ -99,7 +99,7 @@ fn without_interruptions(scenario: &Scenario) -> String {
     toml::to_string(&table).expect("a scenario of plain values is TOML")
 }
 
-/// Leads the process through the phases of a run, and gives it what it had.
+/// Runs the phases of a run with the process, and feeds it its recorded inputs.
 struct Prompter<'a> {
     schedule: <IoxBus as Bus>::Writer<Schedule>,
     health: <IoxBus as Bus>::Reader<Health>,
@@ -120,14 +120,14 @@ impl Prompter<'_> {
     fn lead(&mut self) -> Result<(), LaunchError> {
         for (phase, state) in [(Phase::Gather, RoleState::Open), (Phase::WarmUp, RoleState::Ready)] {
             self.word.phase = phase as u64;
-            let mut told = RoleState::Absent;
-            while told < state && self.goes_on()? {
+            let mut reached = RoleState::Absent;
+            while reached < state && self.goes_on()? {
                 self.announce()?;
                 self.inlets.refresh()?;
                 self.comparer.take(&mut self.outlets)?;
                 std::thread::sleep(Duration::from_millis(1));
                 while self.health.advance()? {}
-                told = self.health.current().map_or(told, |health| RoleState::from_number(health.state));
+                reached = self.health.current().map_or(reached, |health| RoleState::from_number(health.state));
             }
         }
         self.word.phase = Phase::Run as u64;
@@ -145,7 +145,7 @@ impl Prompter<'_> {
         self.await_tick(self.script.steps.last().map_or(0, |step| step.tick + 1))
     }
 
-    /// Waits until everything before a tick has come back.
+    /// Waits until all outputs before a tick have come.
     fn await_tick(&mut self, tick: u64) -> Result<(), LaunchError> {
         let mut backoff = Backoff::default();
         loop {
@@ -193,7 +193,7 @@ impl Prompter<'_> {
         self.word.phase = Phase::Stop as u64;
         let limit_ns = monotonic_ns() + END_LIMIT.as_nanos() as u64;
         while self.process.ended().is_none() && monotonic_ns() < limit_ns {
-            // A link that fails now changes nothing: the process is ended anyway.
+            // A link that fails now changes nothing: the process is killed.
             let _ = self.announce();
             std::thread::sleep(Duration::from_millis(1));
         }

@@ -13,7 +13,7 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-/// The files of a run.
+/// The names of a run's files.
 pub(crate) use crate::seat::SUMMARY;
 pub(crate) const SCENARIO: &str = "scenario.toml";
 pub(crate) const HASHES: &str = "hashes.txt";
@@ -25,15 +25,15 @@ pub(crate) const LATENCY_LOG: &str = "latency.hlog";
 const LOCK: &str = "run.lock";
 /// The beginning of the lock's text.
 const LOCK_HEAD: &str = "corotate ";
-/// The most of the lock's text that is quoted, bytes.
+/// The longest part of the lock's text that is quoted, bytes.
 const LOCK_TEXT: u64 = 128;
 /// The number of attempts at a lock that another process has removed meanwhile.
 const ATTEMPTS: u32 = 100;
 /// The files that a campaign's directory has from its first case on.
-const OF_CAMPAIGN: [&str; 2] = ["campaign.toml", "journal"];
-/// What a report's page begins its generator's name with.
+const CAMPAIGN_FILES: [&str; 2] = ["campaign.toml", "journal"];
+/// The beginning of the generator's name in a report's page.
 pub(crate) const GENERATOR: &str = "<meta name=\"generator\" content=\"corotate";
-/// How a recording begins: the magic bytes, the header's kind and length, and its texts with their lengths.
+/// The beginning of a recording: the magic bytes, the header's kind and length, and its texts with their lengths.
 const RECORDING_MAGIC: &[u8] = b"\x89MCAP0\r\n\x01";
 const RECORDING_HEAD: u64 = 64;
 const RECORDING_PROFILE: &[u8] = b"\x04\0\0\0ros2";
@@ -46,9 +46,9 @@ type IsOurs = fn(&[u8]) -> bool;
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum ResultsError {
-    /// A file that a run would write is there, and is none of an older run.
+    /// A file that a run would write exists, and is not from an older run.
     #[error(
-        "{} is there and is not known to be an older run's of this program; name another directory with --out, or remove it",
+        "{} exists and is not from an older run of this program; name another directory with --out, or remove it",
         path.display()
     )]
     #[strum(serialize = "foreign-file")]
@@ -57,7 +57,7 @@ pub enum ResultsError {
         path: PathBuf,
     },
     /// Another run writes to the directory.
-    #[error("{} takes the results of another run that is under way{holder}; wait for its end, or name another directory with --out", path.display())]
+    #[error("another run writes its results to {}{holder}; wait for its end, or name another directory with --out", path.display())]
     #[strum(serialize = "directory-busy")]
     Busy {
         /// The directory.
@@ -65,8 +65,8 @@ pub enum ResultsError {
         /// The run and its process, as far as they are known.
         holder: String,
     },
-    /// The directory has the results of an earlier run.
-    #[error("{} has files of an earlier run: {}; name another directory with --out, or give --overwrite to remove them", path.display(), names(files))]
+    /// The directory holds the results of an earlier run.
+    #[error("{} holds files of an earlier run: {}; name another directory with --out, or give --overwrite to remove them", path.display(), names(files))]
     #[strum(serialize = "earlier-run")]
     Finished {
         /// The directory.
@@ -74,14 +74,14 @@ pub enum ResultsError {
         /// The files.
         files: Vec<PathBuf>,
     },
-    /// The directory is a campaign's.
-    #[error("{} has the results of a campaign; name another directory with --out", path.display())]
+    /// The directory belongs to a campaign.
+    #[error("{} holds the results of a campaign; name another directory with --out", path.display())]
     #[strum(serialize = "campaign-directory")]
     Campaign {
         /// The directory.
         path: PathBuf,
     },
-    /// The directory cannot be made, looked at, or cleared.
+    /// The directory cannot be created, read or cleared.
     #[error("{}: {source}; name another directory with --out", path.display())]
     #[strum(serialize = "cannot-use-directory")]
     Directory {
@@ -94,12 +94,12 @@ pub enum ResultsError {
 
 /// The default directory of runs.
 pub const RUNS: &str = "runs";
-/// The link in it to the newest.
+/// The link in it to the newest run.
 pub const LATEST: &str = "latest";
-/// The most runs of one scenario that begin in one second.
+/// The largest number of runs of one scenario that begin in one second.
 const DIRECTORIES: u32 = 10_000;
 
-/// The directory for the results of a run that began then: as given, or a new one under `runs/`.
+/// Returns the directory for the results of a run that began at `started`: the given one, or a new one under `runs/`.
 ///
 /// # Errors
 /// Those of the system, with the path.
@@ -120,13 +120,13 @@ pub fn make_directory(given: Option<&Path>, name: &str, started: SystemTime) -> 
             other => return other.map(|()| path.clone()).map_err(|error| named(&path, error)),
         }
     }
-    Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{stem} and {DIRECTORIES} more are there already")))
+    Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{stem} and {DIRECTORIES} more exist already")))
 }
 
-/// Makes a run's directory the newest of `runs/`, if that is where it lies: a link, made in one step.
+/// Points the link `runs/latest` at a run's directory, in one step, if it lies in `runs/`.
 ///
 /// # Errors
-/// Those of the system, and where something else than a link has the name.
+/// Those of the system, and if the name belongs to something other than a link.
 pub fn make_latest(directory: &Path) -> io::Result<()> {
     let runs = match fs::canonicalize(RUNS) {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
@@ -141,7 +141,7 @@ pub fn make_latest(directory: &Path) -> io::Result<()> {
     }
 }
 
-/// An identifier for a new run.
+/// Returns an identifier for a new run.
 ///
 /// # Errors
 /// Those of the system's source of random numbers.
@@ -149,7 +149,7 @@ pub fn new_run() -> io::Result<RunId> {
     Ok(RunId::from_bits(random_bits()?.to_ne_bytes()))
 }
 
-/// A directory that takes the results of one run, locked against others until this is dropped.
+/// A directory for the results of one run, locked against other runs until this is dropped.
 #[derive(Debug)]
 #[must_use]
 pub struct Claim {
@@ -161,19 +161,19 @@ pub struct Claim {
 
 impl Drop for Claim {
     fn drop(&mut self) {
-        // While it is still locked: a process that comes next makes a lock of its own.
+        // Removed while it is still locked: the next process creates a lock of its own.
         let _ = fs::remove_file(self.path.join(LOCK));
     }
 }
 
-/// Locks a directory for the results of a run, and makes it where it does not exist. Files of an earlier run of ours are removed
-/// if `overwrite` says so, and else are a reason to refuse the directory.
+/// Locks a directory for the results of a run, and creates it if it does not exist. Files of an earlier run are removed if
+/// `overwrite` is true; otherwise the directory is refused.
 ///
 /// # Errors
-/// [`ResultsError`]; nothing has been removed then, unless the system refused to remove one of several files.
+/// [`ResultsError`]. Nothing has been removed then, unless the system refused to remove one of several files.
 pub fn claim(directory: &Path, run: RunId, overwrite: bool) -> Result<Claim, ResultsError> {
     files::create_directories(directory).map_err(failed(directory))?;
-    if OF_CAMPAIGN.iter().all(|name| directory.join(name).is_file()) {
+    if CAMPAIGN_FILES.iter().all(|name| directory.join(name).is_file()) {
         return Err(ResultsError::Campaign { path: directory.to_owned() });
     }
     let mut claim = Claim { path: directory.to_owned(), _lock: lock(directory, run)?, removed: Vec::new() };
@@ -184,7 +184,7 @@ pub fn claim(directory: &Path, run: RunId, overwrite: bool) -> Result<Claim, Res
     }
     empty.iter().chain(&written).try_for_each(|path| fs::remove_file(path).map_err(failed(path)))?;
     claim.removed = written;
-    // It stays if somebody else has put something there.
+    // It stays if it is not empty.
     match fs::remove_dir(directory.join(LATENCY)) {
         Err(error) if !matches!(error.kind(), ErrorKind::NotFound | ErrorKind::DirectoryNotEmpty) => {
             Err(failed(&directory.join(LATENCY))(error))
@@ -193,7 +193,7 @@ pub fn claim(directory: &Path, run: RunId, overwrite: bool) -> Result<Claim, Res
     }
 }
 
-/// Makes the lock file of a directory, or takes over that of a run that was killed, and writes down which run holds it.
+/// Creates the lock file of a directory, or takes over that of a killed run, and writes the run's identifier into it.
 fn lock(directory: &Path, run: RunId) -> Result<File, ResultsError> {
     let path = directory.join(LOCK);
     let failed = |source| ResultsError::Directory { path: path.clone(), source };
@@ -202,7 +202,7 @@ fn lock(directory: &Path, run: RunId) -> Result<File, ResultsError> {
         let opened = files::open_with(&path, options.read(true).write(true).create(true), OFlags::NOFOLLOW);
         let mut file = opened.map_err(failed)?;
         let mut text = String::new();
-        // A file that is not valid text is not ours either.
+        // A file that is not valid text is not ours.
         let read = (&file).take(LOCK_TEXT).read_to_string(&mut text);
         if read.is_err() || !(text.is_empty() || text.starts_with(LOCK_HEAD)) {
             return Err(ResultsError::Foreign { path });
@@ -228,7 +228,7 @@ fn is_empty(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|file| file.len() == 0)
 }
 
-/// The names of files, for a message.
+/// Returns the names of files, for a message.
 fn names(files: &[PathBuf]) -> String {
     let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let (mut latency, names): (Vec<_>, Vec<_>) =
@@ -239,7 +239,7 @@ fn names(files: &[PathBuf]) -> String {
 }
 
 impl Claim {
-    /// The names of the files that were removed, for a message; `None` if there were none.
+    /// Returns the names of the removed files, for a message; `None` if none was removed.
     pub fn removed_names(&self) -> Option<String> {
         (!self.removed.is_empty()).then(|| names(&self.removed))
     }
@@ -250,7 +250,7 @@ fn failed(path: &Path) -> impl FnOnce(io::Error) -> ResultsError {
     |source| ResultsError::Directory { path, source }
 }
 
-/// The files in the place of a run's, all of which are an older run's.
+/// Returns the files of an older run that have the names of a run's files.
 fn older(directory: &Path) -> Result<Vec<PathBuf>, ResultsError> {
     let kinds: [(&str, IsOurs); 5] = [
         (SUMMARY, is_summary),
@@ -280,7 +280,7 @@ fn older(directory: &Path) -> Result<Vec<PathBuf>, ResultsError> {
     Ok(older)
 }
 
-/// The file if it exists and is ours.
+/// Returns the file if it exists and is ours.
 fn known(path: PathBuf, limit: u64, is_ours: IsOurs) -> Result<Option<PathBuf>, ResultsError> {
     let about = match fs::symlink_metadata(&path) {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
@@ -291,7 +291,7 @@ fn known(path: PathBuf, limit: u64, is_ours: IsOurs) -> Result<Option<PathBuf>, 
     }
     let mut head = Vec::new();
     files::open(&path).and_then(|file| file.take(limit).read_to_end(&mut head)).map_err(failed(&path))?;
-    // What was begun and never written holds nothing of anybody's.
+    // An empty file was begun and never written.
     if head.is_empty() || is_ours(&head) { Ok(Some(path)) } else { Err(ResultsError::Foreign { path }) }
 }
 
@@ -328,7 +328,7 @@ mod tests {
         assert_ne!(new_run().unwrap(), new_run().unwrap());
     }
 
-    /// A file that is merely named like ours stays, and so does everything beside it.
+    /// A file of another program with the name of ours is kept, and so is everything beside it.
     #[test]
     fn a_foreign_file_refuses_the_directory_and_nothing_is_removed() {
         let names = ["summary.json", "scenario.toml", "hashes.txt", "run.mcap", "report.html", "latency/a.step.hgrm"];
@@ -338,7 +338,9 @@ mod tests {
             fs::create_dir_all(path.parent().unwrap()).unwrap();
             let ours = directory.path().join(if name == "hashes.txt" { "scenario.toml" } else { "hashes.txt" });
             fs::write(&ours, format!("# {}", new_run().unwrap().comment())).unwrap();
-            for content in ["name = \"mine\"\n", "{\"schema\":\"corotate/summary/v1\"}", "\u{89}MCAP0 of somebody"] {
+            for content in
+                ["name = \"mine\"\n", "{\"schema\":\"corotate/summary/v1\"}", "\u{89}MCAP0 of another program"]
+            {
                 fs::write(&path, content).unwrap();
                 let refused = claim(directory.path(), new_run().unwrap(), true).unwrap_err();
                 assert!(matches!(&refused, ResultsError::Foreign { path: told } if *told == path), "{refused}");

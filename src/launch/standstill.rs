@@ -127,7 +127,7 @@ mod tests {
     fn what_forbids_to_attach_has_a_remedy() {
         let remedies =
             [("0", false), ("1", false), ("2", true), ("", false)].map(|(scope, root)| remedy_of(scope, root));
-        assert_eq!(remedies, [None; 4], "a role that is to be debugged lets everybody attach who may in scope 1");
+        assert_eq!(remedies, [None; 4], "in scope 1 a debugged role permits any tracer");
         assert!(remedy_of("2", false).is_some() && remedy_of("3", true).is_some());
     }
 

@@ -1,7 +1,6 @@
-//! A run in one thread that its caller makes tick by tick: he is the controller. Everything else is as in any run in one thread, and
-//! so are the bits.
+//! A run in one thread that its caller steps tick by tick, as the controller. All else, to the bit, is as in any run in one thread.
 //!
-//! Must not decide anything for the controller: a tick without a command has none.
+//! Must not decide anything for the controller.
 
 use super::{LaunchError, Outcome};
 use crate::bus::Port;
@@ -20,7 +19,7 @@ use crate::telemetry::Ledger;
 use std::cell::RefCell;
 use std::rc::Rc;
 
-/// A run that is stepped.
+/// A run that its caller steps.
 ///
 /// ```
 /// use corotate::config::SHIPPED;
@@ -92,7 +91,7 @@ impl TruthReader {
         })
     }
 
-    /// Takes the newest truth; without one the state is the one before.
+    /// Reads the newest truth; without one the state stays.
     fn read(&mut self, scenario: &Scenario) -> Result<(), BusError> {
         let ((first, count), state) = (self.applied, &mut self.state);
         while let Some(words) = self.reader.next()? {
@@ -105,10 +104,10 @@ impl TruthReader {
     }
 }
 
-/// Hands the caller's commands on.
-struct Given(Rc<RefCell<Vec<Vec<u64>>>>);
+/// The caller's commands.
+struct CallerCommands(Rc<RefCell<Vec<Vec<u64>>>>);
 
-impl RoleFunction for Given {
+impl RoleFunction for CallerCommands {
     fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String> {
         for (output, given) in tick.outputs.iter_mut().zip(self.0.borrow().iter()) {
             output.copy_from_slice(given);
@@ -118,10 +117,10 @@ impl RoleFunction for Given {
 }
 
 impl Steps {
-    /// A run of a scenario before its first tick.
+    /// Creates a run of a scenario, before its first tick.
     ///
     /// # Errors
-    /// [`LaunchError`]; [`LaunchError::NotStepped`] where it has no controller, a fleet, or a role that a fault kills.
+    /// [`LaunchError`]; [`LaunchError::NotStepped`] if it has no controller, a fleet, or a role that a fault kills.
     pub fn new(mut scenario: Scenario) -> Result<Self, LaunchError> {
         scenario.clock = ClockKind::InProcess;
         let refuse = |reason| Err(LaunchError::NotStepped { reason });
@@ -129,37 +128,37 @@ impl Steps {
         if !roles.contains(&RoleId::Controller) {
             return refuse("it has no controller");
         }
-        let of_controller = ports(&scenario, RoleId::Controller);
-        if of_controller.reads.iter().any(|port| port.fleet) {
-            return refuse("a fleet is driven as one, by our controller alone");
+        let controller_ports = ports(&scenario, RoleId::Controller);
+        if controller_ports.reads.iter().any(|port| port.fleet) {
+            return refuse("a fleet accepts commands from the built-in controller only");
         }
         let bus = MemoryBus::new(depths(&scenario));
         let scorer = open_scorer(&scenario, &bus)?;
         let seats: Vec<(RoleId, Ledger)> =
             roles.into_iter().map(|role| (role, private_ledger(&scenario, role))).collect();
-        let readers = of_controller
+        let readers = controller_ports
             .reads
             .iter()
             .map(|port| Ok::<_, BusError>((port.reader(&bus, Reader::Scorer)?, Order::default())));
         let readers = readers.collect::<Result<Vec<_>, _>>()?;
         let content = |port: &Port| vec![0; port.size / size_of::<u64>() - STAMP];
-        let commands = Rc::new(RefCell::new(of_controller.writes.iter().map(content).collect()));
+        let commands = Rc::new(RefCell::new(controller_ports.writes.iter().map(content).collect()));
         let node = |(role, ledger): &(RoleId, Ledger)| {
             let role_impl = match role {
-                RoleId::Controller => RoleImpl::Function(*role, Box::new(Given(Rc::clone(&commands)))),
+                RoleId::Controller => RoleImpl::Function(*role, Box::new(CallerCommands(Rc::clone(&commands)))),
                 role => RoleImpl::from(*role),
             };
             build(&scenario, role_impl, &bus, ledger)
         };
         let nodes = seats.iter().map(node).collect::<Result<Vec<_>, _>>()?;
-        let (inputs, outputs) = (vec![None; readers.len()], of_controller.writes);
+        let (inputs, outputs) = (vec![None; readers.len()], controller_ports.writes);
         let written = seats.iter().flat_map(|(role, _)| ports(&scenario, *role).writes);
         let truths = written.filter(|port| port.topic.signal == Signal::Truth);
         let truths = truths.map(|port| TruthReader::new(&port, &bus)).collect::<Result<_, _>>()?;
         Ok(Self { scenario, seats, nodes, scorer, readers, inputs, outputs, commands, truths, tick: 0, _bus: bus })
     }
 
-    /// Lets bodies and observer make the next tick, up to where the controller is to act; false once there is none.
+    /// Runs bodies and observer of the next tick, up to the controller's turn. Returns false after the last tick.
     ///
     /// # Errors
     /// [`LaunchError`].
@@ -187,38 +186,38 @@ impl Steps {
         Ok(true)
     }
 
-    /// The state of every body at the current tick.
+    /// Returns the state of every body at the current tick.
     pub fn bodies(&self) -> impl Iterator<Item = &BodyState> {
         self.truths.iter().map(|truth| &truth.state)
     }
 
-    /// What the controller has of the tick at hand: the estimate, then each driven body's measurement, as words with their stamps.
+    /// Returns the controller's samples of the current tick: the estimate, then each driven body's measurement, as words with stamps.
     pub fn inputs(&self) -> &[Option<Vec<u64>>] {
         &self.inputs
     }
 
-    /// The commands that it is to give, one for each driven body.
+    /// Returns the ports of its commands, one for each driven body.
     pub fn outputs(&self) -> &[Port] {
         &self.outputs
     }
 
-    /// The current tick.
+    /// Returns the current tick.
     pub fn tick(&self) -> u64 {
         self.tick
     }
 
-    /// The latest value of the rig's first metric.
+    /// Returns the latest value of the rig's first metric.
     pub fn metric(&self) -> f64 {
         self.scorer.latest()
     }
 
-    /// Gives the commands of the tick at hand, as words without their stamps, and ends it.
+    /// Sends the commands of the current tick, as words without stamps, and ends the tick.
     ///
     /// # Errors
     /// [`LaunchError`].
     ///
     /// # Panics
-    /// If they are not as many, or not as long, as [`outputs`](Self::outputs) says.
+    /// If their number or lengths differ from [`outputs`](Self::outputs).
     pub fn act(&mut self, commands: &[&[u64]]) -> Result<(), LaunchError> {
         let mut given = self.commands.borrow_mut();
         assert_eq!(commands.len(), given.len(), "one command for each driven body");
@@ -232,16 +231,17 @@ impl Steps {
         Ok(())
     }
 
-    /// Ends the run, wherever it is, with its scores and counters.
+    /// Ends the run at any tick, and returns its scores and counters.
     ///
     /// # Errors
     /// [`LaunchError`].
     pub fn finish(mut self) -> Result<Outcome, LaunchError> {
         self.nodes.iter_mut().try_for_each(|node| node.finish())?;
         let score = self.scorer.finish()?;
-        let of = |(role, ledger): &(RoleId, Ledger)| report(&self.scenario, *role, ledger, Vec::new(), Vec::new());
+        let role_report =
+            |(role, ledger): &(RoleId, Ledger)| report(&self.scenario, *role, ledger, Vec::new(), Vec::new());
         Ok(Outcome {
-            reports: self.seats.iter().map(of).collect(),
+            reports: self.seats.iter().map(role_report).collect(),
             recording: None,
             unbooked: Vec::new(),
             problems: Vec::new(),
@@ -256,7 +256,7 @@ impl Steps {
     }
 }
 
-/// Words of a stamp.
+/// Length of a stamp, words.
 const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
 
 fn step(node: &mut ReadyNode, tick: u64) -> Result<(), LaunchError> {

@@ -1,6 +1,6 @@
 //! The summary of a run: verdict, counters, hash, latencies; and the files that hold it.
 //!
-//! Must not soften anything: what was not measured is said to be so.
+//! Must not hide anything: a missing measurement is reported as missing.
 
 use super::Score;
 use super::criteria::{Criterion, Judge, accepted, verdict};
@@ -33,7 +33,7 @@ pub struct Summary {
     schema: String,
     /// The program's version.
     pub version: String,
-    /// The revision of its sources.
+    /// The revision of its source code.
     pub revision: String,
     /// The run's identifier, which all of its files carry.
     pub run: Option<RunId>,
@@ -49,29 +49,29 @@ pub struct Summary {
     pub started_utc: String,
     /// The machine.
     pub host: MachineInfo,
-    /// Roles that had no process of their own, with the role in whose process they were.
+    /// Roles without a process of their own, with the role whose process they shared.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub hosted: BTreeMap<String, String>,
     domain: Option<PathBuf>,
-    /// The signal that ended the run before its time, or 0.
+    /// The signal that ended the run early, or 0.
     pub signal: usize,
-    /// Whether every criterion that could be judged holds; none if none could be.
+    /// True if all judged criteria hold; `None` if none was judged.
     pub accepted: Option<bool>,
-    /// The same in words, with the reason where nothing was judged.
+    /// The verdict in words, with the reason if nothing was judged.
     pub verdict: String,
     /// One entry per criterion.
     pub criteria: Vec<Criterion>,
     /// The score.
     pub score: Score,
-    /// Roles that failed while the ticks ran, and what became of them.
+    /// Roles that failed while the ticks ran, with the reactions.
     pub incidents: Vec<Incident>,
-    /// What a reader of the results must know of the scenario.
+    /// Notes on the scenario for readers of the results.
     pub notes: Vec<String>,
-    /// The physical bounds that samples are held against.
+    /// The physical bounds against which samples are checked.
     pub limits: Vec<Figure>,
-    /// What the watchdog saw, if anything is watched.
+    /// The watchdog's report, if it watches anything.
     pub watchdog: Option<WatchReport>,
-    /// What may be claimed of the loop, per driven body.
+    /// The claims about the loop, per driven body.
     pub certificates: Vec<Claim>,
     /// The counters.
     pub books: Accounting,
@@ -79,16 +79,16 @@ pub struct Summary {
     pub state: State,
     /// One entry per role and stage, in the order of a tick.
     pub latencies: Vec<StageFigures>,
-    /// The counters of the serial lines, by the body whose seat a device has; as far back as its bridge was started.
+    /// The counters of the serial lines, by the body that a device simulates, since the last start of its bridge.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub lines: BTreeMap<String, LineCounters>,
     /// The part of each host, if the run had several.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub hosts: Option<NetworkStatistics>,
-    /// What was recorded, if that was asked for.
+    /// The recording, if there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub recording: Option<RecordingReport>,
-    /// Everything that was asked of the machine.
+    /// The requested privileges.
     pub privileges: Vec<RoleGrant>,
     /// Roles with a process of their own that report no privileges.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -100,19 +100,19 @@ pub struct Summary {
 pub struct RoleGrant {
     /// The role, or `launcher`.
     pub role: String,
-    /// What it asked for and got.
+    /// The request and its result.
     #[serde(flatten)]
     pub grant: Grant,
 }
 
-/// What a run came to, held against its scenario.
+/// The verdict on a run by its scenario's criteria.
 pub(crate) struct Judged {
     latencies: Vec<StageFigures>,
     pub books: Accounting,
     pub(super) criteria: Vec<Criterion>,
-    /// Whether every criterion that could be judged holds; none if none could be.
+    /// True if all judged criteria hold; `None` if none was judged.
     pub accepted: Option<bool>,
-    /// The same in words.
+    /// The verdict in words.
     pub verdict: String,
 }
 
@@ -123,14 +123,14 @@ impl Judged {
         let lost = outcome.incidents.iter().filter(|incident| incident.action == Action::Stopped);
         let lost: Vec<&str> =
             lost.flat_map(|incident| incident.with.iter().chain([&incident.role])).map(String::as_str).collect();
-        // A run that is stepped ends where its caller leaves it.
+        // A stepped run ends at the tick where its caller stops.
         let ends_early = |report: &RoleReport| report.ticks.elapsed <= scenario.last_tick;
         let left = scenario.clock == ClockKind::InProcess && outcome.reports.iter().any(ends_early);
         let interrupted = outcome.signal != 0 || !lost.is_empty() || left;
         let books = Accounting::new(scenario, outcome, interrupted, &lost);
         let judge = Judge { scenario, outcome, books: &books, latencies: &latencies, interrupted };
         let criteria = judge.criteria();
-        // A run that lost a role is not accepted, whatever its criteria say.
+        // A run that lost a role is not accepted, whether or not its criteria hold.
         let accepted = accepted(&criteria, interrupted).or((!lost.is_empty()).then_some(false));
         let verdict = verdict(accepted, &criteria, interrupted);
         Self { latencies, books, criteria, accepted, verdict }
@@ -147,7 +147,7 @@ impl Summary {
     /// Reads a summary.
     ///
     /// # Errors
-    /// The reason, if it has another layout or lacks something.
+    /// The reason, if it has another layout or is incomplete.
     pub fn parse(text: &str) -> Result<Self, String> {
         #[derive(Deserialize)]
         struct Head {
@@ -160,7 +160,7 @@ impl Summary {
         serde_json::from_str(text).map_err(|error| error.to_string())
     }
 
-    /// Draws up the summary of a run that began at `started`.
+    /// Creates the summary of a run that began at `started`.
     pub fn new(scenario: &Scenario, outcome: &Outcome, started: SystemTime) -> Self {
         let Judged { latencies, books, criteria, accepted, verdict } = Judged::new(scenario, outcome);
         Self {
@@ -216,7 +216,7 @@ fn privileges(outcome: &Outcome) -> Vec<RoleGrant> {
     own.chain(roles).collect()
 }
 
-/// The processes of which it is not known what they were granted: where others tell, those that tell nothing.
+/// Returns the processes whose privileges are unknown: those without a report while others have one.
 fn privileges_unknown(scenario: &Scenario, outcome: &Outcome) -> Vec<String> {
     if scenario.clock != crate::config::ClockKind::Realtime {
         return Vec::new();
@@ -241,7 +241,7 @@ pub fn write_run(directory: &Path, scenario: &Scenario, summary: &Summary) -> io
     })?;
     write(&directory.join(HASHES), |out| {
         let run = run.as_ref().map_or(String::new(), |run| format!("{run}: "));
-        writeln!(out, "# {run}ticks from the first on, hash over everything published in them")?;
+        writeln!(out, "# {run}number of ticks from the first on, hash over all samples published in them")?;
         summary.state.checkpoints.iter().try_for_each(|(ticks, hash)| writeln!(out, "{ticks} {hash:016x}"))
     })?;
     if summary.latencies.is_empty() {

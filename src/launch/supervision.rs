@@ -1,10 +1,10 @@
-//! One role, seen from the launcher: its process, its heartbeat, its starts; and what became of it when it failed.
+//! One role as the launcher sees it: its process, its heartbeat, its starts and failures.
 //!
-//! Must not decide when a run ends, nor lead it; [`super::processes`] does.
+//! Must not decide when a run ends; [`super::processes`] does.
 
 use super::LaunchError;
 use super::children::{END_LIMIT, RoleProcess};
-use super::incident::{Action, Failure, Incident, Replacement};
+use super::incident::{Action, Incident, Replacement, RoleFailure};
 use super::janitor::Janitor;
 use super::standstill::{Standstill, standstill};
 use super::trace::Trace;
@@ -21,36 +21,37 @@ use crate::seat::{device_failure_path, failure_path, open_ledger, panic_path, re
 use crate::system::tell;
 use crate::telemetry::Ledger;
 
-/// The most that one look adds to a role's silence, ns. Whoever stops the whole machine, or just the launcher, stops the
-/// clock of silence too: a role is only judged for the time in which it was listened to.
+/// Longest time that one look adds to a role's silence, ns. If the machine or the launcher is paused, the time of the pause
+/// does not count as a role's silence.
 const LOOK_MAX_NS: u64 = 100_000_000;
 
-/// After so long a silence `/proc` is asked whether a role is stopped, ns, and so often again.
+/// Silence after which `/proc` is asked if the role is stopped, and the interval between two such looks, ns.
 const STANDSTILL_NS: u64 = 250_000_000;
 const STANDSTILL_LOOK_NS: u64 = 50_000_000;
 
-/// A successor that fails sooner than this may have died of the state that it inherited, ns.
+/// A successor that fails sooner than this may have failed because of its inherited state, ns.
 const DISTRUSTED_NS: u64 = 1_000_000_000;
 
-/// An external role that is seen by its samples alone may be silent for at least so many periods.
+/// Shortest timeout of an external role without heartbeat, in periods.
 const SILENT_PERIODS: f64 = 10.0;
 
-/// So many starts in a row may end with the same panic: the second of them began without the state of the first.
+/// Number of consecutive starts that may end with the same panic; the second one begins without the state of the first.
 const PANICS_MAX: u64 = 2;
 
-/// The program in the seat of an external role, by what it sends.
+/// The program that executes an external role, as its samples show it.
 #[derive(Default)]
 struct Occupant {
     writer: Option<WriterProcess>,
-    /// When it sent its last sample, ns.
+    /// Time of its last sample, ns.
     sent_ns: u64,
     last_tick: Option<u64>,
-    /// The program that left the seat, until its successor sends; then with the tick of that sample and how long the seat was empty, s.
+    /// The program that ended, until its successor sends.
     left: Option<Left>,
+    /// The tick of the successor's first sample, and the time without a sample, s.
     back: Option<(u64, f64)>,
 }
 
-/// A program that left its seat, and the tick that it had not sent.
+/// A program that ended, and the first tick that it did not send.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Left {
     pid: u32,
@@ -58,8 +59,8 @@ struct Left {
 }
 
 impl Occupant {
-    /// Looks who writes. `next_tick` is that after the last sample before this look, `run` the first and the last tick of the newest
-    /// samples without a gap.
+    /// Updates the writer. `next_tick` is the tick after the last sample before this look; `run` holds the first and the last tick
+    /// of the newest samples without a gap.
     fn look(&mut self, writer: Option<WriterProcess>, next_tick: u64, run: Option<(u64, u64)>, now_ns: u64) {
         let before = self.writer;
         self.writer = writer.or(before);
@@ -76,59 +77,59 @@ impl Occupant {
         }
     }
 
-    /// Returns the program that left, the process that took its seat, the tick of its first sample, and how long the seat was empty, s:
-    /// once.
+    /// Returns, once, the program that ended, its successor's process, the tick of the successor's first sample, and the time
+    /// without a sample, s.
     fn replaced(&mut self) -> Option<(Left, u32, u64, f64)> {
         let (tick, outage_s) = self.back.take()?;
         Some((self.left.take()?, self.writer?.pid, tick, outage_s))
     }
 }
 
-/// One role, seen from the launcher, with what else is in its process.
+/// One role, with the other roles of its process.
 pub(super) struct Member {
     pub name: String,
     pub role: RoleId,
-    /// None for a role that somebody else starts, and between a death and the next start.
+    /// `None` for an external role, and between a failure and the restart.
     pub process: Option<RoleProcess>,
     pub external: bool,
-    /// The other host that has it, if one has.
+    /// The other host that runs it, if it is not this one.
     host: Option<String>,
     pub last: Health,
     pub ledger: Ledger,
-    /// The other roles in its process, all earlier in a tick, with their counters.
+    /// The other roles of its process, all earlier in a tick, with their ledgers.
     hosted: Vec<(RoleId, Ledger)>,
-    /// What an external role sends; all there is to go by where it says nothing of itself.
+    /// The samples of an external role: the only source of its state if it publishes no heartbeat.
     trace: Option<Trace>,
     /// The program that sends its samples.
     occupant: Occupant,
     health: <IoxBus as Bus>::Reader<Health>,
-    /// True if a stop by a signal or a debugger is waited for without limit, as in lockstep.
+    /// True if the run waits without limit for a role that a signal or debugger has stopped, as in lockstep.
     patient: bool,
-    /// Since when it is stopped, ns, and when that was looked at last.
+    /// Time since which it is stopped, and time of the last look, ns.
     stopped_ns: Option<u64>,
     stop_looked_ns: u64,
     /// True if it was killed because a debugger held it when the run ended.
     released: bool,
-    /// Health of an earlier generation is a dead role's.
+    /// A heartbeat of an earlier generation belongs to an ended process.
     generation: u64,
     silent_ns: u64,
     looked_ns: u64,
     /// True once the run's ticks have begun.
     in_ticks: bool,
-    /// No more tick will be due.
+    /// True once no more tick will be due.
     over: bool,
-    /// True once it has failed for good: nothing more is waited for.
+    /// True once it has failed and is not restarted.
     lost: bool,
     started_ns: u64,
     restarts: u64,
-    /// When the successor is due, and when the failure was noticed, ns.
+    /// Due time of the restart, and time of the failure, ns.
     restart: Option<(u64, u64)>,
-    /// The panic that the last start ended with, at which tick, and how many starts in a row ended so.
+    /// The panic that ended the last start, its tick, and the number of consecutive starts that ended with it.
     panicked: Option<(Panic, u64, u64)>,
 }
 
 impl Member {
-    /// A role whose process, unless somebody else starts it, is still to be given.
+    /// Creates a role without a process.
     pub fn new(
         scenario: &Scenario,
         role: RoleId,
@@ -138,8 +139,8 @@ impl Member {
     ) -> Result<Self, LaunchError> {
         let now_ns = monotonic_ns();
         let name = role.name(scenario).to_owned();
-        let hosted = role.process_members(scenario).into_iter().filter(|other| *other != role);
-        let hosted = hosted.map(|other| Ok((other, open_ledger(domain, scenario, other)?)));
+        let hosted = role.process_members(scenario).into_iter().filter(|member| *member != role);
+        let hosted = hosted.map(|member| Ok((member, open_ledger(domain, scenario, member)?)));
         Ok(Self {
             hosted: hosted.collect::<Result<_, LaunchError>>()?,
             health: bus.reader(&topic(scenario, &name, Signal::Health), Reader::Role)?,
@@ -169,23 +170,23 @@ impl Member {
         })
     }
 
-    /// The same on another host, if it is on one.
+    /// Sets the other host that runs it, if any.
     pub fn on_host(self, host: Option<&str>) -> Self {
         Self { host: host.map(str::to_owned), ..self }
     }
 
-    /// The same with its process.
+    /// Sets its process.
     #[cfg(feature = "hosts")]
     pub fn with_process(self, process: RoleProcess) -> Self {
         Self { process: Some(process), ..self }
     }
 
-    /// The other host that has it, if one has.
+    /// Returns the other host that runs it, if it is not this one.
     pub fn host(&self) -> Option<&str> {
         self.host.as_deref()
     }
 
-    /// All roles in its process with their counters, in the order of a tick.
+    /// Returns all roles of its process with their ledgers, in the order of a tick.
     pub fn books(&self) -> impl Iterator<Item = (RoleId, &Ledger)> {
         self.hosted.iter().map(|(role, ledger)| (*role, ledger)).chain([(self.role, &self.ledger)])
     }
@@ -202,7 +203,7 @@ impl Member {
         RoleState::from_number(self.last.state)
     }
 
-    /// Hears how the role is; an external one that does not tell is seen by its samples.
+    /// Reads the role's heartbeat, or, if an external role has none, its samples.
     pub fn listen(&mut self, now_ns: u64) -> Result<(), BusError> {
         self.silent_ns += now_ns.saturating_sub(self.looked_ns).min(LOOK_MAX_NS);
         self.looked_ns = now_ns;
@@ -214,31 +215,31 @@ impl Member {
         }
         if let Some(trace) = &mut self.trace {
             let (before, _) = trace.newest();
-            let told = trace.look()?;
-            // A host's relay sends for all processes there.
+            let seen = trace.look()?;
+            // A host's relay sends for all processes of that host.
             if self.host.is_none() {
                 self.occupant.look(trace.writer(), before, trace.newest().1, now_ns);
             }
-            if !self.health.has_writer() && told != self.last && self.state() < RoleState::Done {
-                self.last = told;
+            if !self.health.has_writer() && seen != self.last && self.state() < RoleState::Done {
+                self.last = seen;
                 self.silent_ns = 0;
             }
         }
         Ok(())
     }
 
-    /// Sets whether a stop is waited for without limit.
+    /// Sets if the run waits for a stopped role without limit.
     pub fn set_patient(&mut self, patient: bool) {
         self.patient = patient;
     }
 
-    /// The process that has this seat, if it is one of this host.
+    /// Returns the process that executes this role, if it is on this host.
     pub fn pid(&self) -> Option<i32> {
         let external = || self.occupant.writer.filter(|_| self.external_here()).map(|writer| writer.pid as i32);
         self.process.as_ref().map(RoleProcess::pid).or_else(external)
     }
 
-    /// Looks for a stop of its process, or a debugger.
+    /// Returns how a signal or debugger holds its process, if one does.
     fn standstill(&self) -> Option<Standstill> {
         standstill(self.pid()?)
     }
@@ -248,13 +249,13 @@ impl Member {
         self.stopped_ns.is_some()
     }
 
-    /// Returns true if a debugger is attached to it, and it runs and is heard.
+    /// Returns true if a debugger is attached to it while it runs and sends heartbeats.
     pub fn runs_in_debugger(&self) -> bool {
         let attached = |held: Standstill| held.debugger.is_some() && !held.stopped;
         self.silent_ns < STANDSTILL_NS && self.standstill().is_some_and(attached)
     }
 
-    /// Looks whether a silent role is stopped where that is waited for. Returns the line to print once it is, and once it goes on.
+    /// Checks if a silent role is stopped while the run waits for it. Returns the line to print when it stops, and when it goes on.
     pub fn look_at_standstill(&mut self, now_ns: u64) -> Option<String> {
         let silent = self.silent_ns >= STANDSTILL_NS;
         if !self.patient || !(silent || self.is_stopped()) || now_ns < self.stop_looked_ns + STANDSTILL_LOOK_NS {
@@ -267,7 +268,7 @@ impl Member {
                 Some(format!("the {} is {held}; the run waits for it", self.name))
             }
             (None, Some(since_ns)) => {
-                // From here on it has its usual time to speak.
+                // The usual timeout starts again here.
                 (self.stopped_ns, self.silent_ns) = (None, 0);
                 let stopped_s = now_ns.saturating_sub(since_ns) as f64 / 1e9;
                 Some(format!("the {} goes on after {stopped_s:.1} s", self.name))
@@ -276,7 +277,7 @@ impl Member {
         }
     }
 
-    /// Lets a stopped process end with the run: undoes a signal's stop, and kills what a debugger holds.
+    /// Lets a stopped process end with the run: continues it after a stop by a signal, and kills it if a debugger holds it.
     pub fn release(&mut self) {
         let Some(process) = self.process.as_mut() else { return };
         if process.ended().is_some() {
@@ -293,26 +294,25 @@ impl Member {
         }
     }
 
-    /// Notes that the ticks run, and whether no more tick will be due.
+    /// Sets that the ticks run, and if no more tick will be due.
     pub fn in_ticks(&mut self, over: bool) {
         (self.in_ticks, self.over) = (true, over);
     }
 
-    /// Returns true if the role has counters here: then the launcher sees each tick that it completes.
+    /// Returns true if the role has counters on this host, so that the launcher sees each completed tick.
     pub fn counts(&self) -> bool {
         self.ledger.generation() > 0
     }
 
-    /// Whether nothing more will come of it, though it need not have come to its last tick: it is seen by its samples alone,
-    /// and none is due.
+    /// Returns true if no more sample is due from a role without heartbeat. It may have missed its last ticks.
     pub fn spent(&self) -> bool {
         self.over && self.trace.is_some() && !self.health.has_writer()
     }
 
-    /// Returns the incident of an external role whose program has been replaced by another: once, when that sends.
+    /// Returns, once, the incident of an external role whose program was replaced: as soon as the new program sends.
     pub fn replaced(&mut self) -> Option<Incident> {
         let (left, pid, tick, outage_s) = self.occupant.replaced()?;
-        let cause = format!("its program, process {}, left; process {pid} took its seat at tick {tick}", left.pid);
+        let cause = format!("its program, process {}, ended; process {pid} replaced it at tick {tick}", left.pid);
         Some(Incident {
             external: true,
             generation: self.generation,
@@ -321,18 +321,18 @@ impl Member {
             ..Incident::new(
                 self.name.clone(),
                 left.tick,
-                Failure::new("seat-taken-over", cause, String::new()),
+                RoleFailure::new("seat-taken-over", cause, String::new()),
                 Action::Continued,
             )
         })
     }
 
-    /// What it sends, if it is external.
+    /// Returns the samples of an external role.
     pub fn trace(&self) -> Option<&Trace> {
         self.trace.as_ref()
     }
 
-    /// Whether it is on its way out: its process has not ended, or, if it is external, it still has its line open.
+    /// Returns true while its process has not ended, or, if it is external, while it still has a heartbeat writer.
     pub fn lingers(&mut self) -> bool {
         match &mut self.process {
             Some(process) => process.ended().is_none(),
@@ -345,55 +345,55 @@ impl Member {
         self.external && self.host.is_none()
     }
 
-    /// Returns the failure of the role, if any: its process has ended, or it has been silent for too long.
-    pub fn failure(&mut self, scenario: &Scenario, janitor: &mut Janitor) -> Option<Failure> {
+    /// Returns the failure of the role, if its process has ended or its heartbeat has timed out.
+    pub fn failure(&mut self, scenario: &Scenario, janitor: &mut Janitor) -> Option<RoleFailure> {
         if self.external {
-            return self.fell_silent(scenario, janitor);
+            return self.external_failure(scenario, janitor);
         }
         let done = self.state() == RoleState::Done;
         let process = self.process.as_mut()?;
         if let Some(status) = process.ended() {
-            // A role that was done may have left without the word, if this process was kept from giving it.
+            // A role that was done may end without being asked, if this process was delayed.
             return (!(status.success() && done)).then(|| process.failure(status));
         }
-        // A successor has as long to come up as the first.
-        let heard = self.last.stamp.generation >= self.generation;
-        let limit_s = if heard { scenario.supervision.heartbeat_timeout_s } else { scenario.startup_timeout_s };
+        // A restarted role has the same time to start as the first.
+        let started = self.last.stamp.generation >= self.generation;
+        let limit_s = if started { scenario.supervision.heartbeat_timeout_s } else { scenario.startup_timeout_s };
         if self.silent_ns as f64 <= limit_s * 1e9 {
             return None;
         }
         let held = standstill(process.pid());
-        // One that has just gone on is heard before it is judged.
+        // A role that has just been continued can send a heartbeat first.
         if self.patient && (held.is_some() || self.stopped_ns.is_some()) {
             return None;
         }
         process.kill();
-        // A backtrace may take longer than the limit.
+        // Printing a backtrace may take longer than the timeout.
         if let Some(failure) = process.panic() {
             return Some(failure);
         }
-        let (code, said, limit) = match heard {
-            true => ("silent", "said nothing", "supervision.heartbeat_timeout_s"),
+        let (code, state, limit) = match started {
+            true => ("silent", "sent no heartbeat", "supervision.heartbeat_timeout_s"),
             false => ("not-ready", "was not ready", "launch.startup_timeout_s"),
         };
         let cause = match &held {
-            Some(held) => format!("it was {held}, {said} for {limit_s} s and was killed; in lockstep it is waited for"),
-            None => format!("it {said} for {limit_s} s and was killed; on a slow machine raise {limit}"),
+            Some(held) => format!("it was {held}, {state} for {limit_s} s and was killed; lockstep waits for it"),
+            None => format!("it {state} for {limit_s} s and was killed; on a slow machine raise {limit}"),
         };
-        Some(Failure::new(if held.is_some() { "stopped" } else { code }, cause, process.last_words()))
+        Some(RoleFailure::new(if held.is_some() { "stopped" } else { code }, cause, process.last_words()))
     }
 
-    /// Returns how an external role has failed: it left its last words, it is gone, or it is silent in real time. In lockstep a
-    /// role that is silent and alive is computing or waits for the others, so it fails only by leaving, or by
-    /// `launch.external_timeout_s`, which in real time is the limit of a role that is alive. One that is only seen by its samples
-    /// may have missed its last ticks in real time: then it is done, if it is still there once its remains would have been removed.
-    fn fell_silent(&mut self, scenario: &Scenario, janitor: &mut Janitor) -> Option<Failure> {
-        let (state, tells) = (self.state(), self.health.has_writer());
-        let present = tells || self.trace.as_ref().is_some_and(Trace::written);
+    /// Returns the failure of an external role: it reported one, it ended, or in real time its timeout has passed.
+    ///
+    /// In lockstep a silent role may compute or wait for others, so it fails only by ending or by `launch.external_timeout_s`. A role
+    /// without heartbeat may miss its last ticks in real time: it is done if it still exists once its files would have been removed.
+    fn external_failure(&mut self, scenario: &Scenario, janitor: &mut Janitor) -> Option<RoleFailure> {
+        let (state, has_heartbeat) = (self.state(), self.health.has_writer());
+        let present = has_heartbeat || self.trace.as_ref().is_some_and(Trace::written);
         let left = || ("left", "it left before its last tick".to_owned());
         let panic = panic_path(janitor.root(), &self.name);
         let fail = |(code, cause): (&str, String), last_words: String| {
-            Some(Panic::take(&panic).map_or_else(|| Failure::new(code, cause, last_words), Failure::of))
+            Some(Panic::take(&panic).map_or_else(|| RoleFailure::new(code, cause, last_words), RoleFailure::from_panic))
         };
         if state != RoleState::Done
             && let Ok(last_words) = std::fs::read_to_string(failure_path(janitor.root(), &self.name))
@@ -406,27 +406,27 @@ impl Member {
             Some(_) => scenario.host_silence_s(state >= RoleState::Running),
             None => scenario.supervision.heartbeat_timeout_s,
         };
-        let limit_s = if tells { timeout_s } else { timeout_s.max(SILENT_PERIODS * scenario.tick_s()) };
+        let limit_s = if has_heartbeat { timeout_s } else { timeout_s.max(SILENT_PERIODS * scenario.tick_s()) };
         if matches!(state, RoleState::Absent | RoleState::Done) || self.silent_ns as f64 <= limit_s * 1e9 {
             return None;
         }
-        // Not before: a program that was started again in its seat is not there for a moment.
+        // Not before: a program that is being restarted is absent for a moment.
         if self.in_ticks && !present {
             return fail(left());
         }
-        // One that was killed has left once its remains are put away.
+        // A killed program counts as ended once its files are removed.
         if !janitor.is_busy() {
             janitor.clear_dead();
         }
-        if let (true, Some(host)) = (tells, &self.host) {
-            return fail(("host-silent", format!("nothing was heard of it and the host {host} for {limit_s} s")));
+        if let (true, Some(host)) = (has_heartbeat, &self.host) {
+            return fail(("host-silent", format!("no heartbeat from it and the host {host} for {limit_s} s")));
         }
         let held = || self.standstill().map_or(String::new(), |held| format!(" and was {held}"));
-        match (tells, state, scenario.clock) {
+        match (has_heartbeat, state, scenario.clock) {
             (true, _, ClockKind::Realtime) => {
                 let limit_s = scenario.external_timeout_s.map_or(limit_s, |external_s| external_s.max(limit_s));
                 let silent = self.silent_ns as f64 > limit_s * 1e9;
-                silent.then(|| fail(("silent", format!("it said nothing for {limit_s} s{}", held())))).flatten()
+                silent.then(|| fail(("silent", format!("it sent no heartbeat for {limit_s} s{}", held())))).flatten()
             }
             (false, RoleState::Running, ClockKind::Realtime) if self.over => {
                 if self.silent_ns as f64 > 2.0 * limit_s * 1e9 {
@@ -435,14 +435,14 @@ impl Member {
                 None
             }
             (false, RoleState::Running, ClockKind::Realtime) => {
-                fail(("no-samples", format!("it sent nothing for {limit_s} s{}", held())))
+                fail(("no-samples", format!("it sent no sample for {limit_s} s{}", held())))
             }
             _ => None,
         }
     }
 
-    /// Returns the failure of a role that did not end in order. One that was killed because a debugger held it has none.
-    pub fn bad_end(&mut self, reported: bool) -> Option<Failure> {
+    /// Returns the failure of a role that did not end in order, unless it was killed because a debugger held it.
+    pub fn bad_end(&mut self, reported: bool) -> Option<RoleFailure> {
         let process = self.process.as_mut()?;
         match process.ended() {
             Some(status) if status.success() && reported || self.released => None,
@@ -450,8 +450,8 @@ impl Member {
             None => {
                 process.kill();
                 let limit_s = END_LIMIT.as_secs();
-                let cause = format!("it did not end within {limit_s} s of being told to and was killed");
-                Some(Failure::new("did-not-end", cause, process.last_words()))
+                let cause = format!("it did not end within {limit_s} s after the stop, and was killed");
+                Some(RoleFailure::new("did-not-end", cause, process.last_words()))
             }
         }
     }
@@ -466,14 +466,14 @@ impl Member {
             })
     }
 
-    /// Takes note of a failure by which nothing is lost.
-    pub fn note(&mut self, failure: Failure, scenario: &Scenario) -> Incident {
+    /// Records a failure that has no effect on the run.
+    pub fn note(&mut self, failure: RoleFailure, scenario: &Scenario) -> Incident {
         self.process = None;
         self.last.state = RoleState::Done as u64;
         self.incident(failure, scenario, Action::Noted)
     }
 
-    fn incident(&self, failure: Failure, scenario: &Scenario, action: Action) -> Incident {
+    fn incident(&self, failure: RoleFailure, scenario: &Scenario, action: Action) -> Incident {
         let tick = if self.counts() { crate::runtime::next_tick(&self.ledger) } else { self.last.stamp.tick };
         Incident {
             external: self.external,
@@ -483,14 +483,14 @@ impl Member {
         }
     }
 
-    /// Decides what is done about a failure, and prepares it.
-    pub fn fail(&mut self, failure: Failure, scenario: &Scenario, now_ns: u64) -> Incident {
+    /// Decides how to react to a failure, and prepares the restart.
+    pub fn fail(&mut self, failure: RoleFailure, scenario: &Scenario, now_ns: u64) -> Incident {
         let supervision = &scenario.supervision;
         let restart = |(role, _): (RoleId, &Ledger)| supervision.reaction_to(role.name(scenario)) == OnFailure::Restart;
         let repeated = self.panics_again(&failure, scenario.clock);
         let again =
             !self.external && self.books().all(restart) && self.restarts < supervision.restarts_max && !repeated;
-        // A state that kills must not be inherited for ever.
+        // A state that makes its role fail must not be inherited again and again.
         let begins_anew = again && self.generation > 1 && now_ns.saturating_sub(self.started_ns) < DISTRUSTED_NS;
         if begins_anew {
             self.books().for_each(|(_, ledger)| ledger.discard_state());
@@ -498,7 +498,7 @@ impl Member {
         let action = if again { Action::Restarted } else { Action::Stopped };
         self.lost = !again;
         let incident = Incident { begins_anew, repeated, ..self.incident(failure, scenario, action) };
-        // Reaped here, before another process takes the seat.
+        // Reaped here, before the next process starts.
         self.process = None;
         if again {
             self.restarts += 1;
@@ -510,9 +510,9 @@ impl Member {
         incident
     }
 
-    /// Takes note of a panic, and returns true if another start would only repeat it: at once in lockstep, where the same tick
-    /// has the same inputs; in real time after a start that began without the state of the one before.
-    fn panics_again(&mut self, failure: &Failure, clock: ClockKind) -> bool {
+    /// Records a panic. Returns true if a restart would only repeat it: in lockstep at once, because the same tick has the same
+    /// inputs; in real time after a start without the inherited state.
+    fn panics_again(&mut self, failure: &RoleFailure, clock: ClockKind) -> bool {
         let tick = crate::runtime::next_tick(&self.ledger);
         let alike = failure.panic.as_ref().map(|panic| match &self.panicked {
             Some((before, at, starts)) if before.is_like(panic) => (panic.clone(), tick, starts + 1, *at == tick),
@@ -523,7 +523,7 @@ impl Member {
         same_tick || self.panicked.as_ref().is_some_and(|(.., starts)| *starts > PANICS_MAX)
     }
 
-    /// Starts the successor if it is due.
+    /// Restarts the role if that is due.
     pub fn restart(&mut self, scenario: &Scenario, domain: &Domain, now_ns: u64) -> Result<(), LaunchError> {
         match self.restart {
             Some((due_ns, _)) if self.process.is_none() && now_ns >= due_ns => self.start(scenario, domain, now_ns),
@@ -531,7 +531,7 @@ impl Member {
         }
     }
 
-    /// Returns the outage of the role, ns, once, as soon as its successor runs.
+    /// Returns, once, the outage of the role, ns, as soon as its successor runs.
     pub fn back_after_ns(&mut self, now_ns: u64) -> Option<u64> {
         let (_, noticed_ns) = self.restart.filter(|_| self.state() >= RoleState::Running)?;
         self.restart = None;
@@ -548,12 +548,12 @@ mod tests {
     }
 
     #[test]
-    fn a_program_that_takes_a_seat_in_the_midst_is_told_once() {
+    fn a_program_that_replaces_another_is_reported_once() {
         let mut occupant = Occupant::default();
         occupant.look(process(1, 1), 0, None, 0);
         occupant.look(process(1, 1), 0, Some((0, 99)), 1_000_000_000);
         assert_eq!(occupant.replaced(), None);
-        // Its remains are put away, then another one is there, which sends later.
+        // Its files are removed, then another program exists, which sends later.
         occupant.look(None, 100, Some((0, 99)), 1_500_000_000);
         occupant.look(process(1, 2), 100, Some((0, 99)), 2_000_000_000);
         assert_eq!(occupant.replaced(), None);
@@ -573,7 +573,7 @@ mod tests {
     }
 
     #[test]
-    fn a_seat_that_changes_hands_before_the_run_is_no_incident() {
+    fn a_program_that_is_replaced_before_the_run_is_no_incident() {
         let mut occupant = Occupant::default();
         occupant.look(process(1, 1), 0, None, 0);
         occupant.look(process(2, 2), 0, None, 10);

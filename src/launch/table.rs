@@ -1,4 +1,4 @@
-//! The end of a run on the screen.
+//! The results of a run on the screen.
 
 use super::outcome::{LinkCounters, State};
 use super::{Incident, Summary, exact, short};
@@ -11,11 +11,11 @@ use comfy_table::{CellAlignment, Table};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
-/// Rows of results that are shown unless all are asked for: with the rest they fit on a screen of 24 lines.
+/// Rows of results that are shown by default, so that all fits on a screen of 24 lines.
 const RESULT_ROWS: usize = 8;
-/// The end of a serial line's words if nothing went wrong on it.
+/// The end of a serial line's text if it had no fault.
 const NO_FAULT: &str = "; no fault";
-/// Incidents that are shown unless all are asked for.
+/// Incidents that are shown by default.
 const INCIDENTS: usize = 4;
 
 /// Returns the summary as text: results, latencies of estimate and control, counters, and what went wrong. An undisturbed run on one
@@ -64,7 +64,7 @@ pub fn table(summary: &Summary, all: bool) -> String {
     text.lines().flat_map(|line| [line.trim_end(), "\n"]).collect()
 }
 
-/// The counters of a serial line in words, one line for what went well and one for what did not.
+/// Returns the counters of a serial line in words: one line of traffic, one of faults.
 pub fn line_words(body: &str, counters: &LineCounters) -> String {
     let well = format!(
         "line of {body}: {} frames and {} bytes sent, {} and {} received, {}",
@@ -78,19 +78,19 @@ pub fn line_words(body: &str, counters: &LineCounters) -> String {
         },
     );
     let ill = [
-        (counters.restarts, "times the device lost the run, its body at the initial state again"),
+        (counters.restarts, "restarts of the device with its body at the initial state"),
         (counters.crc_errors, "CRC errors"),
         (counters.malformed, "malformed blocks"),
         (counters.dropped_bytes, "bytes dropped"),
         (counters.resyncs, "resyncs"),
-        (counters.sequence_gaps, "frames lost on the way here"),
+        (counters.sequence_gaps, "received frames lost"),
         (counters.repeats, "requests repeated"),
         (counters.unanswered, "ticks unanswered"),
         (counters.late, "late answers"),
-        (counters.duplicates, "answers twice"),
+        (counters.duplicates, "duplicate answers"),
         (counters.echoes, "echoes"),
-        (counters.unsent, "frames the line did not take"),
-        (counters.reopened, "times opened again"),
+        (counters.unsent, "frames not accepted by the line"),
+        (counters.reopened, "reopenings"),
     ];
     let ill: Vec<String> =
         ill.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}")).collect();
@@ -157,7 +157,7 @@ fn results(summary: &Summary, all: bool, text: &mut String) {
 fn watchdog(summary: &Summary, all: bool, text: &mut String) {
     let Some(report) = &summary.watchdog else { return };
     for watched in report.watched.iter().filter(|watched| all || watched.breaches > 0) {
-        let largest = watched.largest.map_or("beyond every number".to_owned(), |largest| format!("{largest:.2e}"));
+        let largest = watched.largest.map_or("not finite".to_owned(), |largest| format!("{largest:.2e}"));
         let (breaches, judged, max) = (watched.breaches, watched.judged, watched.max);
         let _ = write!(text, "watchdog, {}: {breaches} of {judged} beyond {max:e}", watched.quantity);
         let first = watched.first_tick.map_or(String::new(), |tick| format!(", first at tick {tick}"));
@@ -169,9 +169,9 @@ fn watchdog(summary: &Summary, all: bool, text: &mut String) {
 }
 
 fn times(incident: &Incident) -> String {
-    let told =
+    let time =
         |what: &str, seconds: Option<f64>| seconds.map_or(String::new(), |s| format!(", {what} after {} s", digits(s)));
-    told("back", incident.outage_s) + &told("recovered", incident.recovery_s)
+    time("back", incident.outage_s) + &time("recovered", incident.recovery_s)
 }
 
 fn verdict(holds: Option<bool>) -> String {
@@ -270,8 +270,7 @@ fn counters(summary: &Summary, all: bool, text: &mut String) {
         let _ = writeln!(text, "  {problem}");
     }
     if !books.unbooked.is_empty() {
-        let _ =
-            writeln!(text, "no accounting of {}: its signals are counted by their readers", books.unbooked.join(", "));
+        let _ = writeln!(text, "no counters of {}: the readers count its signals", books.unbooked.join(", "));
     }
     let _ = match state.first_disturbed_tick {
         None => {
@@ -285,7 +284,7 @@ fn counters(summary: &Summary, all: bool, text: &mut String) {
     };
 }
 
-/// Why samples were rejected, in words.
+/// Returns the numbers of rejected samples by reason, in words.
 pub(crate) fn reasons(rejected_by: &BTreeMap<String, u64>) -> String {
     let all: Vec<String> =
         rejected_by.iter().map(|(name, count)| format!("{count} {}", name.replace('_', " "))).collect();
@@ -296,7 +295,7 @@ fn hosts(summary: &NetworkStatistics, text: &mut String) {
     for host in &summary.hosts {
         let name = &host.host;
         let _ = match &host.clock {
-            None => writeln!(text, "host {name}: it launched the run; its clock is the run's"),
+            None => writeln!(text, "host {name}: launched the run; its clock is the run's"),
             Some(clock) => writeln!(
                 text,
                 "host {name}: clock {} to {:.1} us (at most {:.1} us), drift {:.2} ppm, there and back in {:.0} us, {} corrections of {:.1} us \
@@ -311,9 +310,9 @@ fn hosts(summary: &NetworkStatistics, text: &mut String) {
             ),
         };
         for silence in &host.silences {
-            let Silence { host: of, tick, seconds, healed } = silence;
-            let end = if *healed { ", then heard again" } else { "" };
-            let _ = writeln!(text, "  from tick {tick} on nothing was heard of {of} for {seconds:.2} s{end}");
+            let Silence { host: silent, tick, seconds, healed } = silence;
+            let end = if *healed { "; then its messages came again" } else { "" };
+            let _ = writeln!(text, "  from tick {tick} on no message came from {silent} for {seconds:.2} s{end}");
         }
         let ill = [
             (host.repeated_frames, "frames sent again"),
@@ -360,7 +359,7 @@ fn privileges(summary: &Summary, all: bool, text: &mut String) {
     }
     let unknown = match summary.privileges_unknown.join(", ") {
         names if names.is_empty() => names,
-        names => format!("; unknown of {names}: no report of any"),
+        names => format!("; unknown for {names}: no report"),
     };
     let _ = writeln!(text, "privileges: {granted} of {} granted{unknown}", summary.privileges.len());
     // One line per reason, not per role.

@@ -1,8 +1,8 @@
-//! What an external role sends, as seen by the launcher.
+//! The samples of an external role, as the launcher sees them.
 //!
-//! It tells how far a role is that says nothing of itself: hardware need not know of health. Such a role is there once all
-//! its signals have a writer, runs once they carry samples, and is done when all of them have reached the last tick. And it
-//! tells which sample of any external role is missing, and what came instead. Must not judge a role that reports its health.
+//! They are the only source of the state of a role without heartbeat, such as hardware: it is ready once all its signals have
+//! a writer, runs once they carry samples, and is done once all of them have reached the last tick. They also show which
+//! sample of any external role is missing. Must not judge a role that sends heartbeats.
 
 use crate::bus::iox::IoxBus;
 use crate::bus::{BusError, Reader, Signal, Topic, WordReader, WriterProcess};
@@ -11,13 +11,13 @@ use crate::sample::{Health, NO_SAMPLE, RoleState, Stamp};
 use crate::scenario::Scenario;
 use std::fmt;
 
-/// The signals of an external role, watched.
+/// The signals of an external role.
 pub(super) struct Trace {
     signals: Vec<Traced>,
     last_tick: u64,
 }
 
-/// One signal, and who needs it.
+/// One signal, and the roles that read it.
 struct Traced {
     signal: Signal,
     end: WordReader,
@@ -25,32 +25,32 @@ struct Traced {
     readers: Vec<RoleId>,
 }
 
-/// What an external role keeps the run waiting for.
+/// The thing of an external role for which the run waits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Lack {
-    /// It stands there, and the run goes on once it has come further.
+    /// The role's next state.
     State(RoleState),
-    /// A sample, in lockstep, with what came last.
+    /// A sample, in lockstep, with the stamp that came last.
     Sample { signal: Signal, tick: u64, came: Option<Stamp> },
-    /// Any sample, in real time, where that of `tick` is due.
+    /// Any new sample, in real time; that of `tick` is due.
     AnySample { signal: Signal, tick: u64, came: Option<Stamp> },
 }
 
 impl Lack {
-    /// Whether this is what was missing before.
+    /// Returns true if the same thing is still missing.
     pub fn is_still(&self, now: &Self) -> bool {
         match (self, now) {
-            (Self::Sample { signal, tick, .. }, Self::Sample { signal: other, tick: now, .. }) => {
-                (signal, tick) == (other, now)
+            (Self::Sample { signal, tick, .. }, Self::Sample { signal: signal_now, tick: tick_now, .. }) => {
+                (signal, tick) == (signal_now, tick_now)
             }
-            (Self::AnySample { signal, came, .. }, Self::AnySample { signal: other, came: now, .. }) => {
-                (signal, came) == (other, now)
+            (Self::AnySample { signal, came, .. }, Self::AnySample { signal: signal_now, came: came_now, .. }) => {
+                (signal, came) == (signal_now, came_now)
             }
             _ => self == now,
         }
     }
 
-    /// The tick of which a sample is missing.
+    /// Returns the tick whose sample is missing.
     pub fn tick(&self) -> Option<u64> {
         match self {
             Self::State(_) => None,
@@ -63,24 +63,26 @@ impl fmt::Display for Lack {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (signal, tick, came) = match self {
             Self::State(RoleState::Absent) => return f.write_str("it has not connected"),
-            Self::State(RoleState::Running | RoleState::Done) => return f.write_str("it has not said that it is done"),
-            Self::State(_) => return f.write_str("it has connected and is not ready"),
+            Self::State(RoleState::Running | RoleState::Done) => {
+                return f.write_str("it has not reported the end of its work");
+            }
+            Self::State(_) => return f.write_str("it has connected but is not ready"),
             Self::Sample { signal, tick, came } | Self::AnySample { signal, tick, came } => (signal, tick, came),
         };
         write!(f, "its {} of tick {tick} is missing; ", signal.name())?;
         match came {
-            None => f.write_str("none has come"),
+            None => f.write_str("no sample has come"),
             Some(stamp) if stamp.generation == 0 => {
-                write!(f, "instead came tick {} of generation 0, which marks a warm-up", stamp.tick)
+                write!(f, "tick {} came instead, with generation 0, which marks a warm-up", stamp.tick)
             }
-            Some(stamp) if stamp.tick < *tick => write!(f, "the last that came is of tick {}", stamp.tick),
-            Some(stamp) => write!(f, "instead came tick {}", stamp.tick),
+            Some(stamp) if stamp.tick < *tick => write!(f, "the last sample is of tick {}", stamp.tick),
+            Some(stamp) => write!(f, "tick {} came instead", stamp.tick),
         }
     }
 }
 
 impl Trace {
-    /// Watches the signals that a role writes.
+    /// Opens the signals that a role writes.
     pub fn open(scenario: &Scenario, role: RoleId, bus: &IoxBus) -> Result<Self, BusError> {
         let roles = RoleId::all(scenario);
         let reads = |role: &RoleId, topic: &Topic| ports(scenario, *role).reads.iter().any(|port| port.topic == *topic);
@@ -92,23 +94,24 @@ impl Trace {
         Ok(Self { signals: signals.collect::<Result<_, BusError>>()?, last_tick: scenario.last_tick })
     }
 
-    /// The process that writes the first signal.
+    /// Returns the process that writes the first signal.
     pub fn writer(&self) -> Option<WriterProcess> {
         self.signals.first()?.end.writer()
     }
 
-    /// The tick after the newest sample of that signal, and the first and the last tick of its newest samples without a gap.
+    /// Returns the tick after the newest sample of that signal, and the first and the last tick of its newest samples without a
+    /// gap.
     pub fn newest(&self) -> (u64, Option<(u64, u64)>) {
         self.signals.first().map_or((0, None), |traced| (traced.seen.next_tick, traced.seen.run))
     }
 
-    /// Whether all signals have a writer.
+    /// Returns true if all signals have a writer.
     pub fn written(&self) -> bool {
         self.signals.iter().all(|traced| traced.end.has_writer())
     }
 
-    /// The first sample that keeps others waiting, as of the last [look](Self::look). `next_tick` tells where a role stands,
-    /// `scored` where the scorer does. In real time nobody waits for a certain sample: what is missing is any new one.
+    /// Returns the first sample for which others waited at the last [look](Self::look). `next_tick` returns a role's next tick;
+    /// `scored` is the scorer's. In real time any new sample will do.
     pub fn lack(
         &self,
         next_tick: impl Fn(RoleId) -> Option<u64> + Copy,
@@ -125,7 +128,7 @@ impl Trace {
         })
     }
 
-    /// What the signals tell by now, as the role itself would.
+    /// Reads the signals, and returns the heartbeat that the role would send.
     pub fn look(&mut self) -> Result<Health, BusError> {
         let mut next_tick = u64::MAX;
         for traced in &mut self.signals {
@@ -144,7 +147,7 @@ impl Trace {
 }
 
 impl Traced {
-    /// Takes what has come; gives the tick after the newest.
+    /// Reads the samples that have come, and returns the tick after the newest.
     fn look(&mut self) -> Result<u64, BusError> {
         while let Some(words) = self.end.next()? {
             self.seen.take(bytemuck::pod_read_unaligned(&bytemuck::cast_slice(words)[..size_of::<Stamp>()]));
@@ -152,33 +155,33 @@ impl Traced {
         Ok(self.seen.next_tick)
     }
 
-    /// The least tick of which somebody still needs a sample. A body needs the command of the tick before its own.
+    /// Returns the earliest tick whose sample is still needed. A body needs the command of the tick before its own.
     fn needed(&self, next_tick: impl Fn(RoleId) -> Option<u64>, scored: Option<u64>) -> Option<u64> {
-        let of = |role: &RoleId| match role {
+        let needed_by = |role: &RoleId| match role {
             RoleId::Plant(_) => next_tick(*role)?.checked_sub(1),
             RoleId::Observer | RoleId::Controller => next_tick(*role),
         };
         let scored = scored.filter(|_| self.signal != Signal::Measurement);
-        self.readers.iter().filter_map(of).chain(scored).min()
+        self.readers.iter().filter_map(needed_by).chain(scored).min()
     }
 }
 
-/// What has come of one signal.
+/// The samples that have come from one signal.
 #[derive(Debug, Default)]
 struct Seen {
-    /// The tick after the newest.
+    /// The tick after the newest sample.
     next_tick: u64,
-    /// The first and the last tick of the newest samples without a gap between them. It goes back as far as anybody who
-    /// waits can still need: the launcher looks seldom and has as long a queue as they have.
+    /// The first and the last tick of the newest samples without a gap. It covers all that a reader can still need, because the
+    /// launcher's queue is as long as a reader's.
     run: Option<(u64, u64)>,
-    /// The stamp of what came last, whatever it is worth.
+    /// The last stamp, valid or not.
     came: Option<Stamp>,
 }
 
 impl Seen {
     fn take(&mut self, stamp: Stamp) {
         self.came = Some(Stamp { generation: stamp.generation & !NO_SAMPLE, ..stamp });
-        // Readers take generation 0 for a warm-up before the first sample only, and for a fall of the generation after it.
+        // For readers generation 0 is a warm-up before the first sample, and a lower generation after it.
         if stamp.generation == 0 && self.run.is_none() {
             return;
         }
@@ -210,22 +213,22 @@ mod tests {
         seen
     }
 
-    /// What keeps a reader waiting is missing, whatever comes after it; what it could still take is there.
+    /// A sample that a reader can no longer receive is missing, even if later ones come.
     #[test]
     fn a_tick_is_missing_if_it_was_not_among_the_last_in_a_row() {
         let has = |ticks: &[u64], tick| seen(ticks).has(tick);
         assert!(!has(&[], 0));
         assert!(has(&[0, 1, 2], 2) && has(&[0, 1, 2], 0) && !has(&[0, 1, 2], 3));
-        assert!(!has(&[0, 1, 3], 2) && !has(&[0, 1, 3, 4, 5], 2), "instead came the next");
+        assert!(!has(&[0, 1, 3], 2) && !has(&[0, 1, 3, 4, 5], 2), "the next tick came instead");
         assert!(has(&[0, 1, 3, 2], 2), "it came late");
-        assert!(has(&[0, 1, 2, 1], 2), "an old one came again");
-        assert!(has(&[7, 8, 9], 8), "the launcher looked too late for the first");
+        assert!(has(&[0, 1, 2, 1], 2), "an earlier tick is repeated");
+        assert!(has(&[7, 8, 9], 8), "the first ticks had passed before the launcher looked");
         assert!(!has(&[u64::MAX, u64::MAX], 0) && has(&[u64::MAX], u64::MAX));
     }
 
-    /// Before the first sample generation 0 is a warm-up; after it readers take it for a sample, and do not wait.
+    /// Generation 0 is a warm-up before the first sample; after it readers count it as a sample.
     #[test]
-    fn a_warm_up_is_no_sample_and_a_fallen_generation_is_one() {
+    fn generation_0_is_a_warm_up_only_before_the_first_sample() {
         let mut seen = Seen::default();
         seen.take(Stamp::default());
         assert!(!seen.has(0) && seen.next_tick == 0);
@@ -235,17 +238,17 @@ mod tests {
     }
 
     #[test]
-    fn the_words_say_what_is_missing_and_what_came() {
+    fn the_missing_and_the_received_sample_are_printed() {
         let stamp = |tick, generation| Some(Stamp { tick, generation, ..Stamp::default() });
         let words = |came| Lack::Sample { signal: Signal::Measurement, tick: 41, came }.to_string();
-        assert_eq!(words(None), "its measurement of tick 41 is missing; none has come");
-        assert!(words(stamp(40, 1)).ends_with("; the last that came is of tick 40"));
-        assert!(words(stamp(43, 1)).ends_with("; instead came tick 43"));
-        assert!(words(stamp(41, 0)).ends_with("; instead came tick 41 of generation 0, which marks a warm-up"));
+        assert_eq!(words(None), "its measurement of tick 41 is missing; no sample has come");
+        assert!(words(stamp(40, 1)).ends_with("; the last sample is of tick 40"));
+        assert!(words(stamp(43, 1)).ends_with("; tick 43 came instead"));
+        assert!(words(stamp(41, 0)).ends_with("; tick 41 came instead, with generation 0, which marks a warm-up"));
     }
 
     #[test]
-    fn a_silent_role_is_there_runs_and_is_done_by_its_samples() {
+    fn samples_show_the_state_of_a_role_without_heartbeat() {
         let overrides = ["clock=lockstep", "duration_s=0.002", "accept={}"].map(str::to_owned);
         let scenario = Scenario::parse(SHIPPED[0].1, "test", &overrides).unwrap();
         let domain = OwnedDomain::create(0).unwrap();
@@ -253,8 +256,8 @@ mod tests {
         let (ours, theirs) = (bus(), bus());
         let mut trace = Trace::open(&scenario, RoleId::named(&scenario, "follower").unwrap(), &ours).unwrap();
         let mut expect = |state: RoleState, tick: u64| {
-            let told = trace.look().unwrap();
-            assert_eq!((RoleState::from_number(told.state), told.stamp.tick), (state, tick));
+            let health = trace.look().unwrap();
+            assert_eq!((RoleState::from_number(health.state), health.stamp.tick), (state, tick));
         };
         expect(RoleState::Absent, 0);
         let mut measurement =

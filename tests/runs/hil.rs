@@ -468,8 +468,8 @@ const BAD_TICK: u64 = 41;
 #[test]
 fn a_role_that_stalls_lockstep_is_named_with_its_missing_sample() {
     let cases: [(Misbehave, &str, u64, &str); 4] = [
-        (|tick, _| (tick < BAD_TICK, tick < BAD_TICK), "measurement", BAD_TICK, "the last that came is of tick 40"),
-        (|tick, _| (true, tick < BAD_TICK), "truth", BAD_TICK, "the last that came is of tick 40"),
+        (|tick, _| (tick < BAD_TICK, tick < BAD_TICK), "measurement", BAD_TICK, "the last sample is of tick 40"),
+        (|tick, _| (true, tick < BAD_TICK), "truth", BAD_TICK, "the last sample is of tick 40"),
         (
             |tick, sample| {
                 sample.stamp.tick += if tick < BAD_TICK { 0 } else { 2 };
@@ -477,7 +477,7 @@ fn a_role_that_stalls_lockstep_is_named_with_its_missing_sample() {
             },
             "measurement",
             BAD_TICK,
-            "instead came tick 43",
+            "tick 43 came instead",
         ),
         (
             |_, sample| {
@@ -486,7 +486,7 @@ fn a_role_that_stalls_lockstep_is_named_with_its_missing_sample() {
             },
             "measurement",
             0,
-            "instead came tick 0 of generation 0, which marks a warm-up",
+            "tick 0 came instead, with generation 0, which marks a warm-up",
         ),
     ];
     for (misbehave, signal, tick, instead) in cases {
@@ -498,7 +498,7 @@ fn a_role_that_stalls_lockstep_is_named_with_its_missing_sample() {
         drop(partner);
         assert_eq!(done.code, Some(4), "{signal}: {done:?}");
         let lack = format!("its {signal} of tick {tick} is missing; {instead}");
-        let cause = format!("it kept the run waiting for 6 s: {lack}");
+        let cause = format!("the run waited 6 s for it: {lack}");
         for line in [
             format!("waiting for follower (external) for 5 s: {lack}"),
             format!("corotate: follower failed at tick {tick}: {cause}; the run ends [waited-too-long]"),
@@ -542,7 +542,7 @@ fn an_external_role_that_never_connects_ends_the_run_at_the_timeout() {
     let done = running.wait();
     assert_eq!(done.code, Some(4), "{done:?}");
     assert!(done.stderr.contains("waiting for follower (external) for 5 s: it has not connected"), "{done:?}");
-    let cause = "follower failed at tick 0: it kept the run waiting for 8 s: it has not connected";
+    let cause = "follower failed at tick 0: the run waited 8 s for it: it has not connected";
     assert!(done.stderr.contains(cause), "{done:?}");
     let summary = done.json();
     assert_eq!(summary["incidents"].as_array().unwrap().len(), 1, "{summary:#}");
