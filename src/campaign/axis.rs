@@ -112,7 +112,7 @@ impl Varied {
             (.., random) => Spread::random(random.as_ref()?, &format!("{at}.random"), checks)?,
         };
         checks.require(raw.names.is_none() || raw.values.is_some(), &format!("{at}.names"), "unused-key", || {
-            "name the values of a list, and there is no list; remove them".to_owned()
+            "have no effect without a list of values; remove them".to_owned()
         });
         let mut varied = Self {
             axis: Axis {

@@ -353,7 +353,7 @@ fn invalid_values_are_refused_with_key_and_remedy() {
         ("controller.gain.transverse_per_s=0.0", "controller.gain.transverse_per_s"),
         ("controller.gain.transverse_per_s=1001.0", "the sampled loop is unstable"),
         ("controller.gain.transvers_per_s=1.0", "did you mean `transverse_per_s`"),
-        ("controller.feedback=truth", "there is no choice `truth`"),
+        ("controller.feedback=truth", "unknown choice `truth`"),
         ("observer.decay_rate_per_s=[4.0, 0.0]", "observer.decay_rate_per_s: 0 is not above zero"),
         ("accept.sync_error_rad_s_max=1.0", "unknown criterion"),
         ("leader.initial_radius_du=1.0", "leader: unknown key"),

@@ -495,10 +495,10 @@ mod tests {
         assert!(matches!(require_private(&link), Err(PrivacyError::NotADirectory { .. })));
         if root() {
             chown(&path, Some(NOBODY), None).unwrap();
-            assert!(refused().contains("belongs to nobody (uid 65534), not to root (uid 0)"), "{}", refused());
+            assert!(refused().contains("(uid 65534), not to root (uid 0)"), "{}", refused());
             chown(&path, Some(0), None).unwrap();
             chown(outer.path(), Some(NOBODY), None).unwrap();
-            assert!(refused().contains("where nobody (uid 65534) can put another"), "{}", refused());
+            assert!(refused().contains("(uid 65534) can put another"), "{}", refused());
         }
     }
 
@@ -575,7 +575,7 @@ mod tests {
         }
         for path in ["to-file", "to-directory/secret", "to-directory/new", "to-nothing"] {
             let error = write(&at(path), b"gone").unwrap_err().to_string();
-            assert!(error.contains("is a link of nobody (uid 65534), and is not followed"), "{error}");
+            assert!(error.contains("(uid 65534), and is not followed"), "{error}");
         }
         assert!(create_directories(&at("to-directory/new")).is_err());
         assert!(create_directories(&at("to-nothing")).is_err() && Directory::open(&at("to-directory")).is_err());

@@ -129,7 +129,7 @@ def _domain(path, wait_s=10.0):
     end = time.monotonic() + wait_s
     while (domain := _corotate.domain_of(path)) is None:
         if time.monotonic() > end:
-            raise _corotate.CorotateError(f"{path} is no run under way: give its domain, its seat file, or the directory given to --out")
+            raise _corotate.CorotateError(f"{path} is not a current run: give its domain, its seat file, or the directory given to --out")
         time.sleep(0.02)
     return str(domain)
 

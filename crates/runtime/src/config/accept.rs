@@ -148,18 +148,13 @@ pub(crate) fn resolve(raw: &Raw, metrics: &toml::Table, setting: &Setting<'_>, c
         peaks || setting.metrics.is_none() || raw.peak_from_s.is_none(),
         "accept.peak_from_s",
         "unused-key",
-        || {
-            "is from when on peaks count, and no criterion is a peak; add one that ends in _peak, or remove it"
-                .to_owned()
-        },
+        || "has no effect without a criterion that ends in _peak; add one, or remove this".to_owned(),
     );
     accept
 }
 
 fn not_negative(path: &str, value: f64, checks: &mut Checks<'_>) {
-    checks.require(value >= 0.0, path, "negative", || {
-        format!("{value} is below zero, which no result can be; give 0 or more")
-    });
+    checks.require(value >= 0.0, path, "negative", || format!("{value} is below zero; give 0 or more"));
 }
 
 fn instant(key: &str, value: Option<f64>, setting: &Setting<'_>, checks: &mut Checks<'_>) -> f64 {
@@ -170,7 +165,9 @@ fn instant(key: &str, value: Option<f64>, setting: &Setting<'_>, checks: &mut Ch
     if value > duration_s {
         checks.warn(
             &path,
-            format!("the run ends at {duration_s} s, before {value} s: what counts from then on is not judged"),
+            format!(
+                "the run ends at {duration_s} s, before {value} s: criteria that apply from then on are not judged"
+            ),
         );
     }
     value
@@ -187,7 +184,7 @@ fn limit(key: &str, raw: Option<&RawTicks>, roles: Option<&[&str]>, checks: &mut
                 let amount = amount(&path, raw, checks);
                 if let Some(roles) = roles {
                     checks.require(roles.contains(&role.as_str()), &path, "unknown-role", || {
-                        format!("there is no such role to count ticks of; {}", nearest(role, roles))
+                        format!("there is no such role; {}", nearest(role, roles))
                     });
                 }
                 limits.extend(amount.map(|amount| (role.clone(), amount)));
@@ -203,7 +200,7 @@ fn amount(path: &str, raw: &RawTicks, checks: &mut Checks<'_>) -> Option<TickAmo
         RawTicks::Count(count) => {
             not_negative(path, *count, checks);
             checks.require(count.fract() == 0.0, path, "not-whole", || {
-                format!("{count} is no count of ticks; give a whole number, or a share such as \"1 %\"")
+                format!("{count} is not a number of ticks; give a whole number, or a share such as \"1 %\"")
             });
             Some(TickAmount::Count(*count as u64))
         }
@@ -211,7 +208,7 @@ fn amount(path: &str, raw: &RawTicks, checks: &mut Checks<'_>) -> Option<TickAmo
             let percent = text.strip_suffix('%').and_then(|number| number.trim().parse::<f64>().ok());
             let percent = percent.filter(|percent| (0.0..=100.0).contains(percent));
             checks.require(percent.is_some(), path, "out-of-range", || {
-                format!("`{text}` is no share of ticks; give one from \"0 %\" to \"100 %\", or a number of ticks")
+                format!("`{text}` is not a share of ticks; give one from \"0 %\" to \"100 %\", or a number of ticks")
             });
             percent.map(|percent| TickAmount::Share(percent / 100.0))
         }

@@ -105,7 +105,7 @@ impl Document {
     pub fn set_by_option(&mut self, option: &str, key: &str, text: &str) -> Result<(), ConfigError> {
         let place = Place::from(format!("{option} {text}"));
         self.assign(key, text, place.clone()).map_err(|error| {
-            ConfigError::invalid(place, key, (&error).into(), format!("{error}; give it as a scenario does"))
+            ConfigError::invalid(place, key, (&error).into(), format!("{error}; write it as in a scenario"))
         })?;
         self.refuse_absurd()
     }
@@ -300,7 +300,7 @@ impl Document {
             Some((key, value)) => {
                 let (code, reason) = if value.is_finite() {
                     let range = format!("give 0 or {SMALLEST:e} to {LARGEST:e} in magnitude");
-                    ("absurd-number", format!("{value:e} is no quantity of any scenario; {range}"))
+                    ("absurd-number", format!("{value:e} is out of range; {range}"))
                 } else {
                     ("not-finite", format!("{value} is not a finite number; give one"))
                 };
@@ -320,7 +320,7 @@ pub fn read_text(reader: impl Read, origin: &Path) -> Result<String, ConfigError
     let mut bytes = Vec::new();
     reader.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(|error| refuse(error.to_string()))?;
     if bytes.len() as u64 > MAX_BYTES {
-        return Err(refuse(format!("it is longer than {MAX_BYTES} bytes, which no scenario is")));
+        return Err(refuse(format!("it is longer than {MAX_BYTES} bytes")));
     }
     String::from_utf8(bytes).map_err(|error| {
         let place = position(&origin.display().to_string(), error.as_bytes(), error.utf8_error().valid_up_to());

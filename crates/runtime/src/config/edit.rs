@@ -34,7 +34,7 @@ impl Document {
     pub fn put(&mut self, path: &str, value: Value, place: &Place) -> Result<(), ConfigError> {
         let copy = value.clone();
         self.put_value(path, value, place.clone()).map_err(|error| {
-            let reason = format!("{error}; name a key of the scenario, as --set does");
+            let reason = format!("{error}; name a key of the scenario, as for --set");
             ConfigError::invalid(place.clone(), path, (&error).into(), reason)
         })?;
         self.refuse_absurd_value(&copy, path.to_owned())

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file could not be read.
-    #[error("{}: cannot be read: {reason}; give the path of a scenario file, or a name that `corotate init --list` tells", shown(&path.display().to_string()))]
+    #[error("{}: cannot be read: {reason}; give the path of a scenario file, or a name from `corotate init --list`", shown(&path.display().to_string()))]
     Read {
         /// The path as given.
         path: PathBuf,
@@ -55,7 +55,7 @@ pub enum PathError {
     #[error("the key is empty")]
     EmptyKey,
     /// The path has too many steps.
-    #[error("no key lies so deep")]
+    #[error("the key has too many parts")]
     TooDeep,
     /// A list is followed by something other than a number.
     #[error("`{}` is a list: `{}` is not a position in it", shown(path), shown(step))]
@@ -66,7 +66,7 @@ pub enum PathError {
         step: String,
     },
     /// The list has no such position.
-    #[error("`{}` has {length} entries, counted from 0: no {index}", shown(path))]
+    #[error("`{}` has {length} entries, counted from 0; there is no entry {index}", shown(path))]
     NoElement {
         /// The list.
         path: String,

@@ -128,7 +128,7 @@ impl FaultCheck<'_, '_, '_> {
     fn check_time(&mut self) {
         let raw = self.raw;
         self.require(raw.ticks >= 1, "ticks", "out-of-range", || {
-            "0 ticks are none; give at least 1, or remove the fault".to_owned()
+            "a fault of 0 ticks has no effect; give at least 1, or remove it".to_owned()
         });
         if raw.kind == Kind::Freeze {
             self.require(raw.from_tick >= 1, "from_tick", "out-of-range", || {
@@ -158,7 +158,7 @@ impl FaultCheck<'_, '_, '_> {
             return Some(driven.iter().filter(wanted).map(|body| Some((*body).to_owned())).collect());
         }
         self.require(raw.body.is_none(), "body", "unused-key", || {
-            "is for the controller, which has a command for each driven body; remove it".to_owned()
+            "is for the controller, which sends a command to each driven body; remove it".to_owned()
         })?;
         let body = if raw.role == "observer" { &*bodies[0].name } else { &*raw.role };
         Some(vec![Some(body.to_owned())])
@@ -174,7 +174,7 @@ impl FaultCheck<'_, '_, '_> {
             Kind::Stall => {
                 let ms = raw.stall_ms?;
                 self.require(ms > 0.0 && ms <= MAX_STALL_MS, "stall_ms", "out-of-range", || {
-                    format!("{ms} ms is no stall; give a number above 0, up to {MAX_STALL_MS}")
+                    format!("a stall of {ms} ms is out of range; give a number above 0, up to {MAX_STALL_MS}")
                 })?;
                 Action::Role(Interruption::Stall { ns: (ms * 1e6) as u64 })
             }
@@ -212,10 +212,10 @@ impl FaultCheck<'_, '_, '_> {
         let number = !matches!(raw.kind, Kind::Freeze | Kind::BitFlip);
         let stamp = words.first < fields.content.first;
         self.require(!stamp || raw.kind == Kind::BitFlip, "field", "wrong-field", || {
-            "belongs to the stamp, of which only bits can flip; use kind = \"bit-flip\" or another field".to_owned()
+            "belongs to the stamp, which accepts only bit flips; use kind = \"bit-flip\" or another field".to_owned()
         })?;
         self.require(!number || kind == FieldKind::F64, "field", "wrong-field", || {
-            "is a word of bits and holds no number; use kind = \"bit-flip\" or \"freeze\", or another field".to_owned()
+            "is a word of bits, not a number; use kind = \"bit-flip\" or \"freeze\", or another field".to_owned()
         })?;
         let change = match raw.kind {
             Kind::Freeze => Change::Freeze,
@@ -260,12 +260,12 @@ impl FaultCheck<'_, '_, '_> {
         let component = self.raw.component?;
         let valid = fields.all.iter().find(|(name, ..)| *name == VALID);
         self.require(valid.is_some(), "kind", "wrong-signal", || {
-            "takes an axis out of what is measured or estimated, and this signal is neither; name a body or the observer"
+            "removes an axis of a measurement or estimate; this signal is neither; name a body or the observer"
                 .to_owned()
         })?;
         let (_, valid, _) = *valid?;
         self.require((1..=fields.axes).contains(&component), "component", "no-such-component", || {
-            format!("there is no axis {component} to lose; give 1 to {}", fields.axes)
+            format!("there is no axis {component}; give 1 to {}", fields.axes)
         })?;
         let words = WordRange { first: fields.content.first + component - 1, count: 1 };
         Some(ContentFault { change: Change::Lose { valid: valid.first }, words })

@@ -169,22 +169,22 @@ pub(crate) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[
             format!("there are two hosts `{name}`; name each once")
         });
         checks.require(!host.roles.is_empty(), &format!("host[{index}].roles"), "empty-list", || {
-            "a host without roles has no part in a run; give it one, or leave it out".to_owned()
+            "a host without roles is useless; give it a role, or remove it".to_owned()
         });
         names.push(name);
     }
     checks.require(hosts.hosts.is_empty() || hosts.hosts.len() <= 16, "host", "too-many", || {
-        format!("{} hosts are more than a run can have; give 16 at the most", hosts.hosts.len())
+        format!("{} hosts are too many; give at most 16", hosts.hosts.len())
     });
     for (index, roles) in processes.iter().enumerate() {
         let apart = roles.iter().any(|role| hosts.host_of(role) != hosts.host_of(&roles[0]));
         checks.require(!apart, &format!("launch.processes[{index}]"), "roles-apart", || {
-            format!("{} are on different hosts and cannot share a process; take them apart", roles.join(", "))
+            format!("{} are on different hosts and cannot share a process; separate them", roles.join(", "))
         });
     }
     for (index, role) in external.iter().enumerate() {
         checks.require(hosts.hosts.is_empty(), &format!("launch.external[{index}]"), "external-with-hosts", || {
-            format!("somebody else's {role} has no part in a run over several hosts; leave it out, or the hosts")
+            format!("a run over several hosts has no external roles; remove {role} here, or the hosts")
         });
     }
     let Network { budget_ticks, silence_timeout_s, link: links, .. } = &hosts.network;
@@ -194,7 +194,7 @@ pub(crate) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[
         .map(|(index, link)| (format!("network.link[{index}].budget_ticks"), link.budget_ticks));
     for (key, ticks) in budgets.chain([("network.budget_ticks".to_owned(), *budget_ticks)]) {
         checks.require((1..=BUDGET_MAX).contains(&ticks), &key, "out-of-range", || {
-            format!("no way takes {ticks} ticks; give 1 to {BUDGET_MAX}")
+            format!("a budget of {ticks} ticks is out of range; give 1 to {BUDGET_MAX}")
         });
     }
     for (index, LinkBudget { from, to, .. }) in links.iter().enumerate() {
@@ -208,11 +208,11 @@ pub(crate) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[
         }
         let again = links[..index].iter().any(|link| (&link.from, &link.to) == (from, to));
         checks.require(from != to && !again, &format!("network.link[{index}].to"), "no-such-link", || {
-            format!("{from} to {to} is no way, or has its budget already; name each way between two hosts once")
+            format!("{from} to {to} is not a link between two hosts, or has a budget already; name each direction once")
         });
     }
     checks.require((0.1..=3600.0).contains(silence_timeout_s), "network.silence_timeout_s", "out-of-range", || {
-        format!("{silence_timeout_s} s is no time to wait for a host that speaks every 0.02 s; give 0.1 to 3600")
+        format!("{silence_timeout_s} s is out of range (heartbeats come every 0.02 s); give 0.1 to 3600")
     });
 }
 
@@ -268,13 +268,13 @@ mod tests {
         for (text, expected) in [
             ("[[host]]\nname = \"A b\"\nroles = []\n", "cannot name files"),
             ("[[host]]\nname = \"a\"\nroles = []\n", "without roles"),
-            ("[[host]]\nname = \"a\"\nroles = [\"nobody\"]\n", "there is no role `nobody`"),
+            ("[[host]]\nname = \"a\"\nroles = [\"pilot\"]\n", "there is no role `pilot`"),
             ("[[host]]\nname = \"a\"\nroles = [\"leader\", \"leader\"]\n", "cannot be on two hosts"),
-            ("[network]\nbudget_ticks = 0\n", "no way takes 0 ticks"),
+            ("[network]\nbudget_ticks = 0\n", "a budget of 0 ticks"),
             ("[network]\nsilence_timeout_s = 0.0\n", "give 0.1 to 3600"),
             ("[[network.link]]\nfrom = \"a\"\nto = \"b\"\nbudget_ticks = 1\n", "there is no host `a`"),
-            ("[[network.link]]\nfrom = \"a\"\nto = \"a\"\nbudget_ticks = 65\n", "no way takes 65 ticks"),
-            ("[[network.link]]\nfrom = \"a\"\nto = \"a\"\nbudget_ticks = 1\n", "is no way"),
+            ("[[network.link]]\nfrom = \"a\"\nto = \"a\"\nbudget_ticks = 65\n", "a budget of 65 ticks"),
+            ("[[network.link]]\nfrom = \"a\"\nto = \"a\"\nbudget_ticks = 1\n", "is not a link"),
             ("[network]\nclock_source = \"sundial\"\n", "sundial"),
         ] {
             let refused = refusals(text);

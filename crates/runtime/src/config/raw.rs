@@ -148,10 +148,7 @@ pub enum Wake {
 
 /// The cores on which the roles run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(
-    untagged,
-    expecting = "there is no such choice; give \"auto\", \"any\", or a list of core numbers such as [0, 1]"
-)]
+#[serde(untagged, expecting = "unknown choice; give \"auto\", \"any\", or a list of core numbers such as [0, 1]")]
 pub enum Cores {
     /// `"auto"` or `"any"`.
     Named(NamedCores),
@@ -249,7 +246,7 @@ pub(crate) struct Accept {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(
     untagged,
-    expecting = "this is no limit on ticks; give a number, a share such as \"1 %\", or a table such as { controller = 5 }"
+    expecting = "the limit has the wrong type; give a number, a share such as \"1 %\", or a table such as { controller = 5 }"
 )]
 pub(crate) enum RawTicks {
     Count(f64),
@@ -261,7 +258,7 @@ pub(crate) enum RawTicks {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(
     untagged,
-    expecting = "there is no such choice; give \"restart\", \"stop\", or a table such as { observer = \"restart\", leader = \"stop\" }"
+    expecting = "unknown choice; give \"restart\", \"stop\", or a table such as { observer = \"restart\", leader = \"stop\" }"
 )]
 pub enum Policy {
     /// The same for all.

@@ -47,7 +47,7 @@ pub(super) enum Refusal {
     UnknownKey { key: String, known: &'static [&'static str] },
     #[error("`{0}` is missing")]
     MissingKey(&'static str),
-    #[error("there is no choice `{word}`; {}", nearest(word, known))]
+    #[error("unknown choice `{word}`; {}", nearest(word, known))]
     UnknownChoice { word: String, known: &'static [&'static str] },
     #[error("got {given}; give {wanted}")]
     WrongType { given: String, wanted: String },

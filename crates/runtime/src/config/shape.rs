@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[derive(Deserialize)]
-    #[serde(untagged, expecting = "there is no such choice; give a word or a number")]
+    #[serde(untagged, expecting = "unknown choice; give a word or a number")]
     #[expect(dead_code, reason = "only its shape is looked at")]
     enum Either {
         Word(String),

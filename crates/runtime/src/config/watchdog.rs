@@ -24,8 +24,8 @@ pub(crate) fn resolve(
         let Some(index) = keys.iter().position(|known| known == name) else {
             let known: Vec<&str> = keys.iter().map(String::as_str).collect();
             let remedy =
-                if known.is_empty() { "this rig tells nothing to watch".to_owned() } else { nearest(name, &known) };
-            checks.refuse(&key, "unknown-quantity", format!("there is no such quantity; {remedy}"));
+                if known.is_empty() { "this rig has no quantity to watch".to_owned() } else { nearest(name, &known) };
+            checks.refuse(&key, "unknown-quantity", format!("unknown quantity; {remedy}"));
             continue;
         };
         checks.positive(&key, *max);
@@ -45,10 +45,10 @@ pub(crate) fn resolve(
     let watches = bounds != WatchBounds { from_tick: bounds.from_tick, ..WatchBounds::NONE };
     let safe = raw.on_breach == OnBreach::Safe;
     checks.require(watches || !safe, "watchdog.on_breach", "no-effect", || {
-        "has nothing to follow from: no bound is given; add one".to_owned()
+        "has no effect without a bound; add one".to_owned()
     });
     checks.require(safe || raw.latch_after_ticks.is_none(), "watchdog.latch_after_ticks", "unused-key", || {
-        "is for on_breach = \"safe\"; set that, or remove it".to_owned()
+        "has no effect without on_breach = \"safe\"; set that, or remove this".to_owned()
     });
     checks.require(raw.latch_after_ticks != Some(0), "watchdog.latch_after_ticks", "out-of-range", || {
         "0 would latch without a breach; give 1 or more".to_owned()

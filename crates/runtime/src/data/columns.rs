@@ -103,7 +103,7 @@ pub fn find(names: &[String], path: &Path, options: &Options) -> Result<Places, 
         let found: Vec<usize> = (0..names.len()).filter(|index| names[*index] == wanted).collect();
         match found[..] {
             [index] => Ok(index),
-            [] => Err(refuse(format!("there is no column `{wanted}`"), "name one that there is")),
+            [] => Err(refuse(format!("there is no column `{wanted}`"), "name an existing one")),
             _ => Err(refuse(format!("{} columns are called `{wanted}`", found.len()), "rename all but one")),
         }
     };

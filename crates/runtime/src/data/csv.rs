@@ -43,7 +43,7 @@ impl Csv {
             return Err(form("the file is UTF-16; save it as UTF-8"));
         }
         if start.contains(&0) {
-            return Err(form("the file is no text; name a CSV file"));
+            return Err(form("the file is not text; name a CSV file"));
         }
         if start.starts_with(b"\xef\xbb\xbf") {
             // The byte order mark is not part of the first line.
@@ -109,11 +109,9 @@ impl Lines {
         if let Some(value) = std::str::from_utf8(cell).ok().and_then(|text| text.parse::<f64>().ok()) {
             return match value {
                 value if value.is_nan() => Ok(None),
-                value if value.is_infinite() => Err(self.no_number(
-                    column,
-                    name,
-                    "is not finite; leave the cell empty where the value is not known",
-                )),
+                value if value.is_infinite() => {
+                    Err(self.no_number(column, name, "is not finite; leave unknown values empty"))
+                }
                 value => Ok(Some(value)),
             };
         }
@@ -122,7 +120,7 @@ impl Lines {
             _ if is_decimal_comma(cell) => {
                 Err(self.no_number(column, name, "has a decimal comma; write its numbers with a point"))
             }
-            _ => Err(self.no_number(column, name, "is no number; mend it, or leave the cell empty")),
+            _ => Err(self.no_number(column, name, "is not a number; correct it, or leave the cell empty")),
         }
     }
 
@@ -134,7 +132,7 @@ impl Lines {
         }
         let Some(value) = self.number(column, name)? else { return Ok(None) };
         let stamp = Stamp::float(value, *unit);
-        stamp.map(Some).ok_or_else(|| self.no_number(column, name, "is out of the range of time stamps; mend it"))
+        stamp.map(Some).ok_or_else(|| self.no_number(column, name, "is out of the range of time stamps; correct it"))
     }
 }
 

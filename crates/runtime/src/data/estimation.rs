@@ -87,7 +87,7 @@ pub enum EstimateError {
         axis: &'static str,
     },
     /// No rate can be chosen.
-    #[error("{path}: no rate can be chosen, for nothing moves in its first rows; give one with --decay")]
+    #[error("{path}: no rate can be chosen, because nothing moves in the first rows; give one with --decay")]
     NoRate {
         /// The log.
         path: String,

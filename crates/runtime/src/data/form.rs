@@ -113,7 +113,7 @@ pub enum DataError {
     },
     /// A row has more or fewer cells than the first.
     #[error(
-        "{}:{line}: the row has {found} cells, the first one has {expected}; mend it, or if its numbers have a decimal comma \
+        "{}:{line}: the row has {found} cells, the first one has {expected}; correct it, or if its numbers have a decimal comma \
          write them with a point", path.display()
     )]
     #[strum(serialize = "row-length")]

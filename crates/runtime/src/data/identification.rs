@@ -113,7 +113,7 @@ struct Filters {
 impl Filters {
     fn new(ways: &Ways, damping_per_s: f64) -> Result<Self, DataError> {
         if let Some(decay) = ways.decay.filter(|decay| !(decay.is_finite() && *decay > 0.0)) {
-            let reason = format!("{decay} is no decay rate; give a number above 0");
+            let reason = format!("a decay rate of {decay} is out of range; give a number above 0");
             return Err(DataError::Option { name: "decay", reason });
         }
         let symmetric =

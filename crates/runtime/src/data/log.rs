@@ -120,7 +120,7 @@ impl Log {
 
     fn new(mut rows: Box<dyn Rows>, path: &Path, options: &Options) -> Result<Self, DataError> {
         if let Some(gap_s) = options.gap_s.filter(|gap_s| !(gap_s.is_finite() && *gap_s > 0.0)) {
-            let reason = format!("{gap_s} is no length of a pause; give a number of seconds above 0");
+            let reason = format!("a pause of {gap_s} s is out of range; give a number above 0");
             return Err(DataError::Option { name: "gap", reason });
         }
         let mut head = VecDeque::new();

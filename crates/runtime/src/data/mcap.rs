@@ -116,7 +116,7 @@ impl Rows for Mcap {
         }
         let columns = self.content.topics.join(", ");
         let (reason, remedy) = match &self.content.topic {
-            Some(topic) => (format!("no topic with an angular velocity is called `{topic}`"), "name one that there is"),
+            Some(topic) => (format!("no topic with an angular velocity is called `{topic}`"), "name an existing one"),
             None => ("no topic has sensor_msgs/msg/Imu, or samples of ours".to_owned(), "log one of these, or CSV"),
         };
         let remedy = remedy.to_owned();
@@ -322,7 +322,7 @@ mod tests {
         assert!((entries[1].time_s - 2e-8).abs() < 1e-22, "{}", entries[1].time_s);
         assert_eq!(log.counts().incomplete, 1);
         let none = Log::open(&path, &Options { topic: Some("ata".to_owned()), ..Options::default() }).err().unwrap();
-        assert!(none.to_string().contains("is called `ata`; name one that there is"), "{none}");
+        assert!(none.to_string().contains("is called `ata`; name an existing one"), "{none}");
     }
 
     /// ROS 2 writes unpacked chunks by default, and packs them on request.

@@ -191,10 +191,10 @@ impl Rows for ParquetLog {
             Cell::Whole(value) if value.unsigned_abs() < 1 << 62 => Some(Stamp::whole(*value, unit)),
             Cell::Float(value) if value.is_nan() => None,
             Cell::Float(value) => match Stamp::float(*value, unit) {
-                None => return Err(self.cell_error(0, "is out of the range of time stamps; mend it")),
+                None => return Err(self.cell_error(0, "is out of the range of time stamps; correct it")),
                 stamp => stamp,
             },
-            Cell::Whole(_) => return Err(self.cell_error(0, "is out of the range of time stamps; mend it")),
+            Cell::Whole(_) => return Err(self.cell_error(0, "is out of the range of time stamps; correct it")),
             Cell::Text(_) => return Err(self.cell_error(0, "is a text; give numbers")),
         };
         let rad_s = self.places.meaning.rates.1.rad_s();
@@ -203,7 +203,7 @@ impl Rows for ParquetLog {
                 Cell::None => f64::NAN,
                 Cell::Whole(value) => *value as f64 * rad_s,
                 Cell::Float(value) if value.is_infinite() => {
-                    return Err(self.cell_error(1 + axis, "is not finite; leave out what is not known"));
+                    return Err(self.cell_error(1 + axis, "is not finite; leave unknown values empty"));
                 }
                 Cell::Float(value) => *value * rad_s,
                 Cell::Text(_) => return Err(self.cell_error(1 + axis, "is a text; give numbers")),

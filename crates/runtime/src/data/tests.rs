@@ -94,13 +94,13 @@ fn an_invalid_log_is_refused_with_place_reason_and_remedy() {
         ("t_s;wx;wy;wz\n0;1,5;2;3\n", "log.csv:2: column wx: `1,5` has a decimal comma; write"),
         ("t_s,wx,wy,wz\n0,0,1,5,2,0,3,0\n", "log.csv:2: the row has 8 cells, the first one has 4"),
         ("t_s,wx,wy,wz\n0,1,2,3\n0.1,1,2\n", "log.csv:3: the row has 3 cells"),
-        ("t_s,wx,wy,wz\n0,1,2,3\n\n0.1,1,two,3\n", "log.csv:4: column wy: `two` is no number"),
+        ("t_s,wx,wy,wz\n0,1,2,3\n\n0.1,1,two,3\n", "log.csv:4: column wy: `two` is not a number"),
         ("t_s,wx,wy,wz\n0,inf,2,3\n", "`inf` is not finite"),
         ("t_s,wx,wy,wz\n0,1e999,2,3\n", "`1e999` is not finite"),
         ("t_s,wx,wy,wz\n1e300,1,2,3\n", "out of the range of time stamps"),
-        ("t_s,wx,wy,wz\n12:30:01,1,2,3\n", "column t_s: `12:30:01` is no number"),
+        ("t_s,wx,wy,wz\n12:30:01,1,2,3\n", "column t_s: `12:30:01` is not a number"),
         ("t,wx,wy,wz\n0,1,2,3\n10020000,1,2,3\n20040000,1,2,3\n", "say what they are in with a unit of time"),
-        ("\0\0", "the file is no text"),
+        ("\0\0", "the file is not text"),
         ("0,1,2,3\n1,1,2,3\n", "if it has no header say so"),
     ] {
         let refused = refusal(text, &none);

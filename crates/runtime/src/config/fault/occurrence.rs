@@ -19,16 +19,16 @@ impl FaultCheck<'_, '_, '_> {
         let (first, second) = (given.next(), given.next());
         if let (Some((first, _)), Some((second, _))) = (first, second) {
             self.require(false, second, "conflicting-keys", || {
-                format!("is a second answer to when it acts, beside `{first}`; give one")
+                format!("cannot be combined with `{first}`; give one of them")
             })?;
         }
         self.require(probability > 0.0 && probability <= 1.0, "probability", "out-of-range", || {
-            format!("{probability} is none with which anything happens; give a number above 0, up to 1")
+            format!("{probability} is out of range; give a probability above 0, up to 1")
         })?;
         let draws = weakly_hard.is_none_or(|hard| hard.pattern == PatternName::Random);
         if let Some((first, _)) = first.filter(|(name, _)| *name != "weakly_hard" || !draws) {
             self.require(probability >= 1.0, "probability", "conflicting-keys", || {
-                format!("is a second answer to when it acts, beside `{first}`; remove one")
+                format!("cannot be combined with `{first}`; remove one of them")
             })?;
         }
         match (every, gilbert_elliott, weakly_hard) {
@@ -42,13 +42,13 @@ impl FaultCheck<'_, '_, '_> {
     /// Requires that the fault lasts long enough for the key to have an effect.
     fn require_ticks(&mut self, name: &str, ticks: u64) -> Option<()> {
         self.require(self.raw.ticks >= ticks, "ticks", "out-of-range", || {
-            format!("{} are too few for `{name}`; give at least {ticks}", self.raw.ticks)
+            format!("{} ticks are too few for `{name}`; give at least {ticks}", self.raw.ticks)
         })
     }
 
     fn every(&mut self, n: u64) -> Option<Occurrence> {
         self.require(n >= 2, "every", "out-of-range", || {
-            format!("every {n} is no interval; give 2 or more, or leave it out for every tick")
+            format!("an interval of {n} is too short; give 2 or more, or remove it for every tick")
         })?;
         self.require_ticks("every", n.saturating_add(1))?;
         Some(Occurrence::Every(n))
@@ -64,12 +64,11 @@ impl FaultCheck<'_, '_, '_> {
         ] {
             self.require((least..=1.0).contains(&value), &format!("gilbert_elliott.{name}"), "out-of-range", || {
                 let from = if least > 0.0 { "above 0" } else { "from 0" };
-                format!("{value} is no such probability; give a number {from}, up to 1")
+                format!("{value} is out of range; give a probability {from}, up to 1")
             })?;
         }
         self.require(when_good != when_bad, "gilbert_elliott.when_bad", "no-effect", || {
-            "is the same as when_good, and the state of the channel changes nothing; give `probability` instead"
-                .to_owned()
+            "equals when_good, so the state of the channel has no effect; give `probability` instead".to_owned()
         })?;
         self.require_ticks("gilbert_elliott", 2)?;
         Some(Occurrence::GilbertElliott(Channel { good_to_bad, bad_to_good, when_good, when_bad }))
@@ -79,13 +78,13 @@ impl FaultCheck<'_, '_, '_> {
         let RawWeaklyHard { misses, window, pattern } = raw;
         let (longest, probability) = (u64::from(WINDOW_MAX), self.raw.probability);
         self.require((2..=longest).contains(&window), "weakly_hard.window", "out-of-range", || {
-            format!("{window} ticks are no window; give 2 to {longest}")
+            format!("a window of {window} ticks is out of range; give 2 to {longest}")
         })?;
         self.require((1..window).contains(&misses), "weakly_hard.misses", "out-of-range", || {
-            format!("{misses} of {window} are no constraint; give 1 to {}", window - 1)
+            format!("{misses} misses of {window} ticks are out of range; give 1 to {}", window - 1)
         })?;
         self.require(pattern != PatternName::Random || probability < 1.0, "probability", "missing-key", || {
-            "is missing for pattern = \"random\", or is 1, which makes it \"burst\"; give a number below 1".to_owned()
+            "pattern = \"random\" needs a number below 1 (1 is \"burst\"); give one".to_owned()
         })?;
         self.require_ticks("weakly_hard", window)?;
         let pattern = match pattern {
@@ -103,7 +102,7 @@ impl FaultCheck<'_, '_, '_> {
         let slack_ticks = if commands { self.setting.actuation_delay_ticks - 1 } else { 0 };
         let delay = Delay { slack_ticks, ..self.lateness()? };
         self.require(delay.bound() > slack_ticks, "delay_ticks", "no-effect", || {
-            format!("no command would be late: with actuation_delay_ticks they have {slack_ticks} ticks; give more")
+            format!("no command would be late, because actuation_delay_ticks allows {slack_ticks} ticks; give more")
         })?;
         Some(delay)
     }
@@ -113,20 +112,20 @@ impl FaultCheck<'_, '_, '_> {
         let ticks = self.raw.delay_ticks?;
         let least = u64::from(jitter_ticks.is_none());
         self.require((least..=MAX_DELAY_TICKS).contains(&ticks), "delay_ticks", "out-of-range", || {
-            format!("{ticks} is no delay that is kept; give {least} to {MAX_DELAY_TICKS}, or drop the sample")
+            format!("a delay of {ticks} ticks is out of range; give {least} to {MAX_DELAY_TICKS}, or drop the sample")
         })?;
         let Some(jitter_ticks) = jitter_ticks else {
             self.require(distribution.is_none(), "distribution", "unused-key", || {
-                "is that of the jitter, and there is none; give jitter_ticks, or remove it".to_owned()
+                "has no effect without jitter_ticks; give that, or remove this".to_owned()
             })?;
             self.require(spread_ticks.is_none(), "spread_ticks", "unused-key", || {
-                "is that of the jitter, and there is none; give jitter_ticks, or remove it".to_owned()
+                "has no effect without jitter_ticks; give that, or remove this".to_owned()
             })?;
             return Some(Delay::constant(ticks));
         };
         let most = MAX_DELAY_TICKS - ticks;
         self.require((1..=most).contains(&jitter_ticks), "jitter_ticks", "out-of-range", || {
-            format!("{jitter_ticks} is no jitter that is kept; give 1 to {most}: no sample is kept for more than {MAX_DELAY_TICKS}")
+            format!("a jitter of {jitter_ticks} ticks is out of range; give 1 to {most}: the longest delay is {MAX_DELAY_TICKS} ticks")
         })?;
         let distribution = distribution.unwrap_or(DistributionName::Uniform);
         if distribution == DistributionName::Uniform {
@@ -136,7 +135,7 @@ impl FaultCheck<'_, '_, '_> {
             return Some(Delay { jitter_ticks, ..Delay::constant(ticks) });
         }
         self.require(spread_ticks.is_some(), "spread_ticks", "missing-key", || {
-            "is missing for this distribution: the mean of a geometric one, the standard deviation of a normal one; add it"
+            "is missing: the mean of the geometric distribution, or the standard deviation of the normal one; add it"
                 .to_owned()
         })?;
         let spread = spread_ticks?;

@@ -140,10 +140,7 @@ pub(super) struct RawObserver {
 
 /// The decay of the identifier's error per unit of excitation: one rate per component, or minus a matrix.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(
-    untagged,
-    expecting = "there is no such choice; give three decay rates, as [5.0, 5.0, 5.0], or a 3 by 3 Hurwitz matrix"
-)]
+#[serde(untagged, expecting = "unknown choice; give three decay rates, as [5.0, 5.0, 5.0], or a 3 by 3 Hurwitz matrix")]
 pub(super) enum IdentifierDecay {
     /// One positive rate per component.
     Rates([f64; 3]),
