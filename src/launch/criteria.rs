@@ -7,7 +7,7 @@ use super::{Action, Outcome};
 use crate::config::{ClockKind, TickAmount, TickLimit};
 use crate::fault::{Action as FaultAction, Interruption};
 use crate::scenario::Scenario;
-use crate::telemetry::Ticks;
+use crate::telemetry::{Percentiles, Ticks};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
 
@@ -15,6 +15,20 @@ use std::fmt;
 const DEFAULT_SHARE: TickAmount = TickAmount::Share(0.01);
 /// The time limit for noticing the death of a role, s.
 const NOTICED_S: f64 = 0.1;
+
+/// A criterion on a latency: key, stage and figure.
+type LatencyCriterion = (&'static str, &'static str, fn(&Percentiles) -> f64);
+
+/// The criteria on latencies. Step and age are those of observer and controller: a body's age includes the time until its command
+/// is due.
+const LATENCIES: [LatencyCriterion; 6] = [
+    ("step_latency_p99_us_max", "step", |figures| figures.p99_us),
+    ("age_p99_us_max", "age", |figures| figures.p99_us),
+    ("age_p999_us_max", "age", |figures| figures.p999_us),
+    ("age_max_us", "age", |figures| figures.max_us),
+    ("lateness_p99_us_max", "lateness", |figures| figures.p99_us),
+    ("lateness_max_us", "lateness", |figures| figures.max_us),
+];
 
 /// A criterion and its verdict.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -155,18 +169,22 @@ impl Judge<'_> {
             let limit = amount.count(self.ticks_from(0)) as f64;
             criteria.push(Criterion::new("unscored_ticks_max", limit, Some(unscored as f64)));
         }
-        if let Some(limit) = accept.step_latency_p99_us_max {
-            let step =
-                |stage: &&StageFigures| stage.stage == "step" && ["observer", "controller"].contains(&&*stage.role);
-            let worst = self.latencies.iter().filter(step).map(|stage| stage.figures.p99_us);
-            // A stage without a figure was not measured, and then the worst is not known.
-            let worst = worst.reduce(|worst, p99| if worst.is_nan() { worst } else { f64::max(p99, worst) });
-            let worst = worst.filter(|worst| !worst.is_nan());
-            // Without a clock there is no latency to judge; in real time a missing one is a failure.
-            let reason = (self.scenario.clock != ClockKind::Realtime).then_some(Unjudged::Clock);
-            criteria.push(Criterion::new("step_latency_p99_us_max", limit, worst).unless(reason));
-        }
+        criteria.extend(accept.latency_max_us.iter().map(|(key, limit)| self.latency(key, *limit)));
         criteria
+    }
+
+    /// Judges the role with the largest latency.
+    fn latency(&self, key: &str, limit: f64) -> Criterion {
+        let (_, stage, figure) = LATENCIES[LATENCIES.iter().position(|(name, ..)| *name == key).unwrap_or(0)];
+        let acts = |role: &str| stage == "lateness" || ["observer", "controller"].contains(&role);
+        let judged = self.latencies.iter().filter(|row| row.stage == stage && acts(&row.role));
+        let figures = judged.map(|row| (&row.role, figure(&row.figures)));
+        // NaN is above every number: a stage without a figure was not measured, and then the largest is not known.
+        let worst = figures.max_by(|(_, a), (_, b)| a.total_cmp(b)).filter(|(_, us)| !us.is_nan());
+        // Without a clock there is no latency to judge; in real time a missing one is a failure.
+        let reason = (self.scenario.clock != ClockKind::Realtime).then_some(Unjudged::Clock);
+        let criterion = Criterion::new(key, limit, worst.map(|(_, us)| us)).unless(reason);
+        Criterion { role: worst.map(|(role, _)| role.clone()), ..criterion }
     }
 
     fn metrics(&self) -> Vec<Criterion> {

@@ -102,7 +102,7 @@ const DIRECTORIES: u32 = 10_000;
 /// Returns the directory for the results of a run that began at `started`: the given one, or a new one under `runs/`.
 ///
 /// # Errors
-/// Those of the system, with the path.
+/// The system error, with the path.
 pub fn make_directory(given: Option<&Path>, name: &str, started: SystemTime) -> io::Result<PathBuf> {
     let named = |path: &Path, error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
     if let Some(path) = given {
@@ -126,7 +126,7 @@ pub fn make_directory(given: Option<&Path>, name: &str, started: SystemTime) -> 
 /// Points the link `runs/latest` at a run's directory, in one step, if it lies in `runs/`.
 ///
 /// # Errors
-/// Those of the system, and if the name belongs to something other than a link.
+/// The system error; also if the name belongs to something other than a link.
 pub fn make_latest(directory: &Path) -> io::Result<()> {
     let runs = match fs::canonicalize(RUNS) {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
@@ -144,7 +144,7 @@ pub fn make_latest(directory: &Path) -> io::Result<()> {
 /// Returns an identifier for a new run.
 ///
 /// # Errors
-/// Those of the system's source of random numbers.
+/// The error of the system's source of random numbers.
 pub fn new_run() -> io::Result<RunId> {
     Ok(RunId::from_bits(random_bits()?.to_ne_bytes()))
 }

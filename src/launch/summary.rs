@@ -231,7 +231,7 @@ fn privileges_unknown(scenario: &Scenario, outcome: &Outcome) -> Vec<String> {
 /// Writes a run's files into `directory`, which exists: `scenario.toml`, `summary.json`, `hashes.txt`, `latency/`.
 ///
 /// # Errors
-/// Those of the file system, with the file's name.
+/// The error of the file system, with the file's name.
 pub fn write_run(directory: &Path, scenario: &Scenario, summary: &Summary) -> io::Result<()> {
     let run = summary.run.map(RunId::comment);
     write(&directory.join(SCENARIO), |out| out.write_all(scenario.to_file().as_bytes()))?;

@@ -53,6 +53,47 @@ fn a_number_limits_all_ticks_and_a_percentage_excludes_injected_ones() {
     }
 }
 
+/// The step is the computation alone; the age also has the delay before it.
+#[test]
+fn a_stall_breaks_the_limit_on_the_age_but_not_on_the_step() {
+    const STALL_US: f64 = 80_000.0;
+    let run = |role: &str, accept: &str| {
+        let fault = format!(r#"--set=fault=[{{kind="stall", role="{role}", from_tick=100, ms=80}}]"#);
+        let accept = format!("--set=accept={{missed_ticks_max={{}}, starved_ticks_max={{}}, {accept}}}");
+        let rate = ["--clock=realtime", "--tick-hz=100", "--duration=2", "--json"];
+        Bench::new().run(&[&["run", "rigid-pair"], &rate[..], &[&fault, &accept]].concat())
+    };
+    let limits = "step_latency_p99_us_max=1e7, age_p999_us_max=1e7, age_max_us=50000, lateness_max_us=1e7";
+    for (role, late) in [("observer", ["observer", "controller"]), ("controller", ["controller", "controller"])] {
+        let done = run(role, limits);
+        assert_eq!(done.code, Some(3), "{done:?}");
+        let summary = done.json();
+        let age = criterion(&summary, "age_max_us");
+        assert!(age["value"].as_f64().unwrap() >= STALL_US - 10_000.0, "{age}");
+        assert!(late.iter().any(|late| age["role"] == *late), "{age}");
+        assert_eq!(age["holds"], false, "{age}");
+        for kept in ["step_latency_p99_us_max", "age_p999_us_max", "lateness_max_us"] {
+            assert_eq!(criterion(&summary, kept)["holds"], true, "{summary:#}");
+        }
+    }
+    let done = run("leader", "age_p99_us_max=1e7, lateness_p99_us_max=1e7, lateness_max_us=50000");
+    let summary = done.json();
+    let lateness = criterion(&summary, "lateness_max_us");
+    assert_eq!((done.code, &lateness["role"], &lateness["holds"]), (Some(3), &"leader".into(), &false.into()));
+}
+
+/// Without a clock there is no latency.
+#[test]
+fn latencies_are_not_judged_in_lockstep() {
+    let accept = "--set=accept={settled_by_s=4.5, sync_error_rad_s_max=1.0, age_max_us=1, lateness_max_us=1}";
+    let done = Bench::new().run(&["run", "rigid-pair", "--clock=in-process", "--duration=5", "--json", accept]);
+    let summary = done.json();
+    assert_eq!((done.code, &summary["accepted"]), (Some(0), &true.into()), "{done:?}");
+    for name in ["age_max_us", "lateness_max_us"] {
+        assert_eq!(criterion(&summary, name)["holds"], Value::Null);
+    }
+}
+
 /// Default limits do not apply to a scenario without criteria.
 #[test]
 fn without_criteria_the_last_line_still_names_missed_ticks() {

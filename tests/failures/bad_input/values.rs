@@ -255,6 +255,8 @@ fn unknown_and_unattainable_criteria_are_refused() {
         ("accept.missed_ticks_max", "{ controller = -1 }", "negative"),
         ("accept.unscored_ticks_max", "{ leader = 1 }", "one-limit"),
         ("accept.step_latency_p99_us_max", "-3", "negative"),
+        ("accept.age_max_us", "-3", "negative"),
+        ("accept.age_p50_us_max", "1", "unknown-criterion"),
         ("accept.sync_eror_rad_s_max", "1", "unknown-criterion"),
         ("accept.sync_error_rad_s", "1", "unknown-criterion"),
         ("accept.foo", "1", "unknown-criterion"),
@@ -295,7 +297,7 @@ fn infinite_undefined_and_absurd_numbers_are_refused_everywhere() {
             }
         }
     }
-    for key in ["accept.missed_ticks_max", "accept.step_latency_p99_us_max", "accept.foo"] {
+    for key in ["accept.missed_ticks_max", "accept.lateness_p99_us_max", "accept.foo"] {
         for number in ["nan", "inf", "-inf"] {
             assert_refused(&with(PAIR, key, number), key, "not-finite");
         }

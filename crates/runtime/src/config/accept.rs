@@ -28,8 +28,8 @@ pub struct Accept {
     pub safe_ticks_max: Option<TickLimit>,
     /// The most ticks without a score. With more, the metrics are not judged.
     pub unscored_ticks_max: Option<TickAmount>,
-    /// Limit of the 99th percentile of the estimate and of the control step, µs.
-    pub step_latency_p99_us_max: Option<f64>,
+    /// Limits of latencies by their keys, µs.
+    pub latency_max_us: Vec<(&'static str, f64)>,
 }
 
 /// A limit on ticks.
@@ -69,7 +69,7 @@ impl Accept {
             && self.metric_peak.is_empty()
             && ticks.into_iter().all(Option::is_none)
             && self.unscored_ticks_max.is_none()
-            && self.step_latency_p99_us_max.is_none()
+            && self.latency_max_us.is_empty()
     }
 
     /// Returns the limits of metrics by their keys.
@@ -92,9 +92,13 @@ pub(crate) fn is_common(key: &str) -> bool {
     keys_of::<Raw>().contains(&key)
 }
 
+/// The limit of the computation alone.
+const STEP: &str = "step_latency_p99_us_max";
+
 /// The scenario of the criteria. Without a rig, `metrics` are unknown, and keys that may be metrics are not checked.
 pub(crate) struct Setting<'a> {
     pub duration_s: f64,
+    pub realtime: bool,
     pub metrics: Option<&'a [&'a str]>,
     pub roles: Option<&'a [&'a str]>,
     /// The roles that can apply a safe command.
@@ -114,11 +118,21 @@ pub(crate) fn resolve(raw: &Raw, metrics: &toml::Table, setting: &Setting<'_>, c
             setting.roles.and(Some(setting.driven)),
             checks,
         ),
-        step_latency_p99_us_max: raw.step_latency_p99_us_max,
+        latency_max_us: raw.latencies().collect(),
         ..Accept::default()
     };
-    let latency = raw.step_latency_p99_us_max;
-    latency.into_iter().for_each(|value| not_negative("accept.step_latency_p99_us_max", value, checks));
+    for (key, limit) in &accept.latency_max_us {
+        not_negative(&format!("accept.{key}"), *limit, checks);
+    }
+    if let [(STEP, _)] = accept.latency_max_us[..]
+        && setting.realtime
+    {
+        checks.warn(
+            &format!("accept.{STEP}"),
+            "only the step is judged: a late sample or command passes; add age_p99_us_max or lateness_p99_us_max"
+                .to_owned(),
+        );
+    }
     match limit("unscored_ticks_max", raw.unscored_ticks_max.as_ref(), None, checks) {
         Some(TickLimit::All(amount)) => accept.unscored_ticks_max = Some(amount),
         Some(TickLimit::ByRole(_)) => checks.refuse(

@@ -240,6 +240,31 @@ pub(crate) struct Accept {
     pub unscored_ticks_max: Option<RawTicks>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub step_latency_p99_us_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub age_p99_us_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub age_p999_us_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub age_max_us: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lateness_p99_us_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lateness_max_us: Option<f64>,
+}
+
+impl Accept {
+    /// Returns the keys and limits of latencies.
+    pub fn latencies(&self) -> impl Iterator<Item = (&'static str, f64)> {
+        let limits = [
+            ("step_latency_p99_us_max", self.step_latency_p99_us_max),
+            ("age_p99_us_max", self.age_p99_us_max),
+            ("age_p999_us_max", self.age_p999_us_max),
+            ("age_max_us", self.age_max_us),
+            ("lateness_p99_us_max", self.lateness_p99_us_max),
+            ("lateness_max_us", self.lateness_max_us),
+        ];
+        limits.into_iter().filter_map(|(key, limit)| Some((key, limit?)))
+    }
 }
 
 /// A limit on ticks as typed.

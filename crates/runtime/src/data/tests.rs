@@ -109,7 +109,7 @@ fn an_invalid_log_is_refused_with_place_reason_and_remedy() {
     let utf16 = Log::from_csv(Cursor::new([0xff, 0xfe, b't', 0]), "log.csv".as_ref(), &none).err().unwrap();
     assert!(utf16.to_string().contains("save it as UTF-8"));
     let gap = Options { gap_s: Some(-1.0), ..Options::default() };
-    assert!(refusal("t_s,wx,wy,wz\n0,1,2,3\n", &gap).contains("give a number of seconds above 0"));
+    assert!(refusal("t_s,wx,wy,wz\n0,1,2,3\n", &gap).contains("give a number above 0"));
     let missing = Log::open("no/such/file".as_ref(), &none).err().unwrap().to_string();
     assert!(missing.contains("cannot read no/such/file"), "{missing}");
 }

@@ -265,7 +265,13 @@ fn resolve_accept(
     let (names, roles) = (rig.map(|rig| rig.metrics()), rig.map(<dyn AnyRig>::roles));
     let bodies = rig.map_or(&[][..], |rig| rig.bodies());
     let driven: Vec<&str> = bodies.iter().filter(|body| body.driven).map(|body| &*body.name).collect();
-    let setting = accept::Setting { duration_s, metrics: names.as_deref(), roles: roles.as_deref(), driven: &driven };
+    let setting = accept::Setting {
+        duration_s,
+        realtime: raw.clock == ClockKind::Realtime,
+        metrics: names.as_deref(),
+        roles: roles.as_deref(),
+        driven: &driven,
+    };
     accept::resolve(&raw.accept, metrics, &setting, checks)
 }
 
