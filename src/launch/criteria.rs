@@ -140,6 +140,7 @@ struct Counted<'a> {
     missed: Option<u64>,
     starved: Option<u64>,
     safe: Option<u64>,
+    late: Option<u64>,
 }
 
 /// The judge of one run.
@@ -270,11 +271,15 @@ impl Judge<'_> {
                 "missed_ticks_max",
                 &accept.missed_ticks_max,
                 (|role| role.missed) as fn(&Counted<'_>) -> Option<u64>,
-                DEFAULT_SHARE,
+                Some(DEFAULT_SHARE),
             ),
-            ("starved_ticks_max", &accept.starved_ticks_max, |role| role.starved, DEFAULT_SHARE),
-            ("safe_ticks_max", &accept.safe_ticks_max, |role| role.safe, TickAmount::Share(0.0)),
+            ("starved_ticks_max", &accept.starved_ticks_max, |role| role.starved, Some(DEFAULT_SHARE)),
+            ("safe_ticks_max", &accept.safe_ticks_max, |role| role.safe, Some(TickAmount::Share(0.0))),
+            ("late_ticks_max", &accept.late_ticks_max, |role| role.late, None),
         ] {
+            // Without real time no tick is late.
+            let reason =
+                (name == "late_ticks_max" && self.scenario.clock != ClockKind::Realtime).then_some(Unjudged::Clock);
             match limit {
                 // As in older scenarios: the sum over all roles.
                 Some(TickLimit::All(TickAmount::Count(limit))) if name == "missed_ticks_max" => {
@@ -283,17 +288,19 @@ impl Judge<'_> {
                     criteria.push(Criterion::new(name, *limit as f64, Some(all as f64)));
                 }
                 Some(TickLimit::All(amount)) => {
-                    criteria.extend(worst(name, &roles, count, |ticks| granted(*amount, ticks)))
+                    let worst = worst(name, &roles, count, |ticks| granted(*amount, ticks));
+                    criteria.extend(worst.map(|criterion| criterion.unless(reason)));
                 }
                 Some(TickLimit::ByRole(by_role)) => criteria.extend(by_role.iter().map(|(role, amount)| {
                     let counted = roles.iter().find(|counted| counted.role == role);
                     let value = counted.and_then(count).map(|ticks| ticks as f64);
                     let limit = granted(*amount, counted.map_or(0, |counted| counted.elapsed)) as f64;
-                    let reason = value.is_none().then_some(Unjudged::Unbooked);
+                    let reason = if value.is_none() { Some(Unjudged::Unbooked) } else { reason.clone() };
                     Criterion::new(format!("{name}.{role}"), limit, value).unless(reason)
                 })),
                 None => {
-                    let by_default = worst(name, &roles, count, |ticks| granted(default, ticks));
+                    let by_default =
+                        default.and_then(|amount| worst(name, &roles, count, |ticks| granted(amount, ticks)));
                     criteria.extend(by_default.map(|criterion| Criterion { default: true, ..criterion }));
                 }
             }
@@ -309,13 +316,20 @@ impl Judge<'_> {
     /// Returns the roles' counts. A role without counters missed the ticks that its readers lack.
     fn roles(&self) -> Vec<Counted<'_>> {
         let booked = self.books.roles.iter().map(|(role, ticks)| {
-            let Ticks { elapsed, missed, starved, safe, .. } = *ticks;
-            Counted { role, elapsed, missed: Some(missed), starved: Some(starved), safe: Some(safe) }
+            let Ticks { elapsed, missed, starved, safe, late, .. } = *ticks;
+            let late = Some(missed + starved + late);
+            Counted { role, elapsed, missed: Some(missed), starved: Some(starved), safe: Some(safe), late }
         });
         let elapsed = self.elapsed();
         let unbooked = self.books.absent_ticks.iter();
-        let unbooked =
-            unbooked.map(|(role, absent)| Counted { role, elapsed, missed: Some(*absent), starved: None, safe: None });
+        let unbooked = unbooked.map(|(role, absent)| Counted {
+            role,
+            elapsed,
+            missed: Some(*absent),
+            starved: None,
+            safe: None,
+            late: None,
+        });
         booked.chain(unbooked).collect()
     }
 

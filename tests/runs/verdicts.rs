@@ -63,7 +63,8 @@ fn a_stall_breaks_the_limit_on_the_age_but_not_on_the_step() {
         let rate = ["--clock=realtime", "--tick-hz=100", "--duration=2", "--json"];
         Bench::new().run(&[&["run", "rigid-pair"], &rate[..], &[&fault, &accept]].concat())
     };
-    let limits = "step_latency_p99_us_max=1e7, age_p999_us_max=1e7, age_max_us=50000, lateness_max_us=1e7";
+    let limits =
+        "step_latency_p99_us_max=1e7, age_p999_us_max=1e7, age_max_us=50000, lateness_max_us=1e7, late_ticks_max=0";
     for (role, late) in [("observer", ["observer", "controller"]), ("controller", ["controller", "controller"])] {
         let done = run(role, limits);
         assert_eq!(done.code, Some(3), "{done:?}");
@@ -72,6 +73,8 @@ fn a_stall_breaks_the_limit_on_the_age_but_not_on_the_step() {
         assert!(age["value"].as_f64().unwrap() >= STALL_US - 10_000.0, "{age}");
         assert!(late.iter().any(|late| age["role"] == *late), "{age}");
         assert_eq!(age["holds"], false, "{age}");
+        let late_ticks = criterion(&summary, "late_ticks_max");
+        assert!(late_ticks["value"].as_f64().unwrap() >= 1.0 && late_ticks["holds"] == false, "{late_ticks}");
         for kept in ["step_latency_p99_us_max", "age_p999_us_max", "lateness_max_us"] {
             assert_eq!(criterion(&summary, kept)["holds"], true, "{summary:#}");
         }
@@ -85,11 +88,11 @@ fn a_stall_breaks_the_limit_on_the_age_but_not_on_the_step() {
 /// Without a clock there is no latency.
 #[test]
 fn latencies_are_not_judged_in_lockstep() {
-    let accept = "--set=accept={settled_by_s=4.5, sync_error_rad_s_max=1.0, age_max_us=1, lateness_max_us=1}";
+    let accept = "--set=accept={settled_by_s=4.5, sync_error_rad_s_max=1.0, age_max_us=1, late_ticks_max=0}";
     let done = Bench::new().run(&["run", "rigid-pair", "--clock=in-process", "--duration=5", "--json", accept]);
     let summary = done.json();
     assert_eq!((done.code, &summary["accepted"]), (Some(0), &true.into()), "{done:?}");
-    for name in ["age_max_us", "lateness_max_us"] {
+    for name in ["age_max_us", "late_ticks_max"] {
         assert_eq!(criterion(&summary, name)["holds"], Value::Null);
     }
 }

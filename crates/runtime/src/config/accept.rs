@@ -26,6 +26,8 @@ pub struct Accept {
     pub starved_ticks_max: Option<TickLimit>,
     /// The most ticks at which a driven body may apply its safe command.
     pub safe_ticks_max: Option<TickLimit>,
+    /// The most ticks that may be missed, lack an input, or be late. Not judged by default.
+    pub late_ticks_max: Option<TickLimit>,
     /// The most ticks without a score. With more, the metrics are not judged.
     pub unscored_ticks_max: Option<TickAmount>,
     /// Limits of latencies by their keys, µs.
@@ -64,7 +66,7 @@ impl TickAmount {
 impl Accept {
     /// Returns true if no criterion is given; then nothing is judged, not even by a default.
     pub fn is_empty(&self) -> bool {
-        let ticks = [&self.missed_ticks_max, &self.starved_ticks_max, &self.safe_ticks_max];
+        let ticks = [&self.missed_ticks_max, &self.starved_ticks_max, &self.safe_ticks_max, &self.late_ticks_max];
         self.metric_max.is_empty()
             && self.metric_peak.is_empty()
             && ticks.into_iter().all(Option::is_none)
@@ -118,6 +120,7 @@ pub(crate) fn resolve(raw: &Raw, metrics: &toml::Table, setting: &Setting<'_>, c
             setting.roles.and(Some(setting.driven)),
             checks,
         ),
+        late_ticks_max: limit("late_ticks_max", raw.late_ticks_max.as_ref(), setting.roles, checks),
         latency_max_us: raw.latencies().collect(),
         ..Accept::default()
     };
@@ -126,6 +129,7 @@ pub(crate) fn resolve(raw: &Raw, metrics: &toml::Table, setting: &Setting<'_>, c
     }
     if let [(STEP, _)] = accept.latency_max_us[..]
         && setting.realtime
+        && accept.late_ticks_max.is_none()
     {
         checks.warn(
             &format!("accept.{STEP}"),

@@ -116,6 +116,17 @@ pub struct Realtime {
     pub spin_us: f64,
     /// The fraction of the period after which the controller continues without missing samples, 0 to 1.
     pub cutoff: f64,
+    /// The lateness of a body, or the age of an estimate or a command, beyond which a tick counts as late, µs. Default: a tenth of
+    /// the period, at least 50 µs.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub late_us: Option<f64>,
+}
+
+impl Realtime {
+    /// Returns the limit beyond which a tick counts as late, ns.
+    pub fn late_ns(&self, period_ns: u64) -> u64 {
+        self.late_us.map_or((period_ns / 10).max(50_000), |us| (us * 1e3) as u64)
+    }
 }
 
 impl Default for Realtime {
@@ -129,6 +140,7 @@ impl Default for Realtime {
             wake_lead_us: 60.0,
             spin_us: 200.0,
             cutoff: 0.75,
+            late_us: None,
         }
     }
 }
@@ -236,6 +248,8 @@ pub(crate) struct Accept {
     pub starved_ticks_max: Option<RawTicks>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub safe_ticks_max: Option<RawTicks>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub late_ticks_max: Option<RawTicks>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub unscored_ticks_max: Option<RawTicks>,
     #[serde(skip_serializing_if = "Option::is_none")]

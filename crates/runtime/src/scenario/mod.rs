@@ -431,7 +431,12 @@ fn check_realtime(realtime: &Realtime, checks: &mut Checks<'_>) {
     checks.require(priority == 0 || (1..=99).contains(&priority), "realtime.priority", "out-of-range", || {
         format!("{priority} is not a SCHED_FIFO priority; give 1 to 99, or 0 to run without")
     });
-    for (key, value) in [("realtime.wake_lead_us", realtime.wake_lead_us), ("realtime.spin_us", realtime.spin_us)] {
+    let late_us = realtime.late_us.unwrap_or_default();
+    for (key, value) in [
+        ("realtime.wake_lead_us", realtime.wake_lead_us),
+        ("realtime.spin_us", realtime.spin_us),
+        ("realtime.late_us", late_us),
+    ] {
         checks.require((0.0..=100_000.0).contains(&value), key, "out-of-range", || {
             format!("{value} us is out of range; give 0 to 100000")
         });

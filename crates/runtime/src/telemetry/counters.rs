@@ -15,6 +15,7 @@ pub struct TickCounters {
     executed: u64,
     missed: u64,
     starved: u64,
+    late: u64,
     safe: u64,
     stalled: u64,
     scripted: u64,
@@ -22,7 +23,7 @@ pub struct TickCounters {
     first_disturbed: Option<u64>,
 }
 
-persist_fields!(TickCounters, next, executed, missed, starved, safe, stalled, scripted, anew, first_disturbed);
+persist_fields!(TickCounters, next, executed, missed, starved, late, safe, stalled, scripted, anew, first_disturbed);
 
 impl TickCounters {
     /// The next tick to execute.
@@ -55,6 +56,12 @@ impl TickCounters {
     pub fn starved(&mut self, tick: u64) {
         self.starved += 1;
         self.disturbed(tick);
+    }
+
+    /// Counts a tick that was executed late, with all its inputs.
+    #[inline]
+    pub fn late(&mut self) {
+        self.late += 1;
     }
 
     /// Counts a tick at which the safe command was applied.
@@ -93,6 +100,7 @@ impl TickCounters {
             executed: self.executed,
             missed: self.missed,
             starved: self.starved,
+            late: self.late,
             safe: self.safe,
             stalled: self.stalled,
             scripted: self.scripted,

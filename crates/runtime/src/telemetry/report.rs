@@ -86,6 +86,10 @@ pub struct Ticks {
     /// Ticks at which a due input was absent: a plant's command, a controller's measurement.
     #[serde(default)]
     pub starved: u64,
+    /// Executed ticks with all inputs that were late: a body's lateness, or the age of an estimate or command, was above
+    /// `realtime.late_us`.
+    #[serde(default)]
+    pub late: u64,
     /// Ticks at which a plant applied its safe command.
     #[serde(default)]
     pub safe: u64,

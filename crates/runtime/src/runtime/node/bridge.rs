@@ -41,6 +41,7 @@ pub struct BridgeNode<R: Rig, B: Bus> {
     missed: MissedTicks,
     reply: Reply<R>,
     lateness: Latency,
+    late_ns: u64,
     serial: Latency,
     age: Latency,
 }
@@ -93,6 +94,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
                 truth: Truth::<R>::default(),
             },
             lateness: Latency::default(),
+            late_ns: scenario.realtime.late_ns(scenario.period_ns),
             serial: Latency::default(),
             age: Latency::default(),
         })
@@ -152,6 +154,8 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         })?;
         if event.missed() {
             self.counters.starved(tick);
+        } else if clock == Clock::Monotonic && self.asked_ns.saturating_sub(origin_ns) > self.late_ns {
+            self.counters.late();
         }
         if self.link.counters().restarts > 0 {
             self.counters.disturbed(tick);

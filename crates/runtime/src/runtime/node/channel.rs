@@ -212,6 +212,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
             stages.enter_missed(missed, self.began_ns);
             stages.step.record(self.began_ns, self.sent_ns);
             stages.age.record(stages.origin_ns, self.sent_ns);
+            stages.late |= self.sent_ns.saturating_sub(stages.origin_ns) > stages.late_ns;
         }
         self.finish_command()
     }
@@ -235,6 +236,11 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
 /// The latency distributions, and the tick that is recorded.
 #[derive(Default)]
 pub struct Stages {
+    /// The age beyond which a tick is late, ns.
+    pub late_ns: u64,
+    /// True if a command of this tick was late, and if one was not computed.
+    pub late: bool,
+    pub starved: bool,
     pub tick: u64,
     /// Origin and sending of the current estimate, and arrival of the last input, ns.
     pub origin_ns: u64,

@@ -65,7 +65,10 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             ledger: context.ledger.reopened(),
             source,
             look: 0,
-            stages: Stages::default(),
+            stages: Stages {
+                late_ns: context.scenario.realtime.late_ns(context.scenario.period_ns),
+                ..Stages::default()
+            },
         })
     }
 
@@ -243,7 +246,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             }
         }
         (self.stages.origin_ns, self.stages.estimate_sent_ns) = (stamp.origin_ns, stamp.sent_ns);
-        self.stages.tick = stamp.tick;
+        (self.stages.tick, self.stages.starved, self.stages.late) = (stamp.tick, starved, false);
         self.skip_to(stamp.tick);
         if starved {
             self.counters.starved(stamp.tick);
@@ -332,7 +335,11 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
             missed.before(*tick).for_each(|due_ns| hop.record_missed(due_ns, *received_ns));
             hop.record(*estimate_sent_ns, *received_ns);
         }
-        self.channels.iter_mut().try_for_each(|channel| channel.finish_tick(stages.as_deref_mut()))
+        self.channels.iter_mut().try_for_each(|channel| channel.finish_tick(stages.as_deref_mut()))?;
+        if self.stages.late && !self.stages.starved {
+            self.counters.late();
+        }
+        Ok(())
     }
 
     fn finish(&mut self) -> Result<(), NodeError> {

@@ -41,6 +41,7 @@ pub struct ObserverNode<R: Rig, B: Bus> {
     source: Option<SampleSource>,
     instants: Instants,
     missed: MissedTicks,
+    late_ns: u64,
     hop: Latency,
     step: Latency,
     age: Latency,
@@ -61,6 +62,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
             source,
             instants: Instants::default(),
             missed: MissedTicks::default(),
+            late_ns: context.scenario.realtime.late_ns(context.scenario.period_ns),
             hop: Latency::default(),
             step: Latency::default(),
             age: Latency::default(),
@@ -216,6 +218,9 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
             self.hop.record(sent, received);
             self.step.record(received, done);
             self.age.record(origin, done);
+            if done.saturating_sub(origin) > self.late_ns {
+                self.counters.late();
+            }
         }
         Ok(self.estimate.finish()?)
     }

@@ -48,6 +48,7 @@ pub struct PlantNode<P: LinkedBody, G, B: Bus> {
     acting_ns: Option<u64>,
     missed: MissedTicks,
     lateness: Latency,
+    late_ns: u64,
     age: Latency,
     step: Latency,
 }
@@ -88,6 +89,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             acting_ns: None,
             missed: MissedTicks::default(),
             lateness: Latency::default(),
+            late_ns: scenario.realtime.late_ns(scenario.period_ns),
             age: Latency::default(),
             step: Latency::default(),
         })
@@ -206,6 +208,8 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         }
         if event.missed() {
             self.counters.starved(tick);
+        } else if self.clock == Clock::Monotonic && now_ns.saturating_sub(self.grid.due_ns(tick)) > self.late_ns {
+            self.counters.late();
         }
         if matches!(event, CommandEvent::Expired | CommandEvent::Safe) {
             self.counters.safe();
