@@ -96,7 +96,7 @@ fn every_command_finds_a_run_by_the_same_names() {
         assert!(seat.code == Some(0) && seat.stdout.contains(domain.to_str().unwrap()), "{run}: {seat:?}");
     }
     let over = bench.run(&["bridge", "--serial", "no-such-line", "--role", "follower", "--domain", "runs/bare"]);
-    assert!(over.code == Some(2) && over.stderr.contains("corotate report runs/bare"), "{over:?}");
+    assert!(over.code == Some(2) && over.says("run-over") && over.stderr.contains("runs/bare"), "{over:?}");
     running.signal(SIGTERM);
     running.wait();
 }

@@ -90,7 +90,9 @@ fn a_rotated_sensor_is_identified_and_compensated() {
     let log = ["throws.csv", "--by", "throw"];
     let identified = bench.run(&[&["identify"], &log[..], &["--method", "tensor", "--json"]].concat()).succeeded();
     let found = identified.json();
-    assert!(found["findings"].to_string().contains("give these axes to an estimate"), "{found}");
+    let tilts = found["tensor"]["tilt_rad"].as_array().unwrap().iter().map(|tilt| tilt.as_f64().unwrap());
+    let largest = format!("{:.1} degrees", tilts.fold(0.0, f64::max).to_degrees());
+    assert!(found["findings"].to_string().contains(&largest), "{largest}: {found}");
     std::fs::write(bench.path("body.json"), &identified.stdout).unwrap();
     let hidden = ["--hidden", "z", "--body", "body.json"];
     let estimated = bench.run(&[&["estimate"], &log[..], &hidden, &["--json"]].concat()).succeeded().json();

@@ -28,6 +28,17 @@ fn replay(bench: &Bench, file: &Path, options: &[&str]) -> Done {
     bench.run(&[&["replay", file.to_str().unwrap()], options].concat())
 }
 
+/// Replays a recording in which a single role differs, and returns its first difference.
+fn replay_difference(bench: &Bench, file: &Path, options: &[&str]) -> Value {
+    let done = replay(bench, file, &[options, &["--json"]].concat());
+    assert_eq!(done.code, Some(3), "{done:?}");
+    let roles = done.json()["roles"].as_array().unwrap().clone();
+    let mut differing = roles.into_iter().filter(|role| role["same"] == false);
+    let role = differing.next().expect("a role differs");
+    assert!(differing.next().is_none(), "{done:?}");
+    role["difference"].clone()
+}
+
 /// Runs a scenario in this thread without a recorder, and returns all published bytes by service.
 fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
     let bus = MemoryBus::new(depths(scenario));
@@ -174,23 +185,30 @@ fn a_changed_bit_is_found_and_a_different_layout_is_refused() {
     };
     flip(4 + 32 + 16, "/corotate/rigid_pair/leader/estimate", 700);
     for options in [&["--role", "observer"][..], &["--role", "observer", "--processes"], &[]] {
+        let difference = replay_difference(&bench, &changed, options);
+        assert_eq!(difference["tick"], 700, "{difference}");
+        assert_eq!(difference["service"], "corotate/rigid-pair/leader/estimate", "{difference}");
+        assert_eq!(difference["field"], "omega_rad_s[2]", "{difference}");
+        assert!(difference["recorded"] != difference["replayed"], "{difference}");
         let done = replay(&bench, &changed, options);
-        assert_eq!(done.code, Some(3), "{done:?}");
-        let place = "tick 700, corotate/rigid-pair/leader/estimate omega_rad_s[2]:\n  recorded ";
-        assert!(done.stdout.contains(place) && done.stdout.contains("\n  replayed "), "{done:?}");
+        for word in ["700", "omega_rad_s[2]"].into_iter().chain(["recorded", "replayed"]) {
+            assert!(done.code == Some(3) && done.stdout.contains(word), "{word}: {done:?}");
+        }
     }
-    let done = bench.run(&["diff", file.to_str().unwrap(), changed.to_str().unwrap()]);
-    assert!(done.code == Some(3) && done.stdout.contains("tick 700, leader/estimate omega_rad_s[2]"), "{done:?}");
+    let done = bench.run(&["diff", file.to_str().unwrap(), changed.to_str().unwrap(), "--json"]);
+    let diff = done.json();
+    let differing = diff["signals"].as_array().unwrap().iter().filter(|signal| signal["same"] == false);
+    let firsts: Vec<_> = differing.map(|signal| (&signal["signal"], &signal["first"])).collect();
+    assert!(done.code == Some(3) && firsts.len() == 1 && *firsts[0].0 == "leader/estimate", "{diff}");
+    assert!(firsts[0].1["tick"] == 700 && firsts[0].1["field"] == "omega_rad_s[2]", "{diff}");
     let tolerant = ["diff", file.to_str().unwrap(), changed.to_str().unwrap(), "--relative", "1e-12"];
     assert_eq!(bench.run(&tolerant).code, Some(0));
     // A changed input changes the observer's output from that tick on.
     flip(4 + 32, "/corotate/rigid_pair/leader/measurement", 500);
-    let done = replay(&bench, &changed, &["--role", "observer"]);
-    assert!(done.code == Some(3) && done.stdout.contains("at tick 500, "), "{done:?}");
+    assert_eq!(replay_difference(&bench, &changed, &["--role", "observer"])["tick"], 500);
     // The last sample is compared too.
     flip(4 + 32, "/corotate/rigid_pair/follower/command", 1000);
-    let done = replay(&bench, &changed, &["--role", "controller"]);
-    assert!(done.code == Some(3) && done.stdout.contains("tick 1000, "), "{done:?}");
+    assert_eq!(replay_difference(&bench, &changed, &["--role", "controller"])["tick"], 1000);
     rewrite(
         &file,
         &changed,
@@ -198,12 +216,10 @@ fn a_changed_bit_is_found_and_a_different_layout_is_refused() {
         |_, _, _| {},
     );
     let done = replay(&bench, &changed, &[]);
-    assert_eq!(done.code, Some(2), "{done:?}");
-    assert!(done.stderr.contains("corotate/rigid-body/estimate/v1 (") && done.stderr.contains(" sum, "), "{done:?}");
-    assert!(
-        done.stderr.contains("corotate/rigid-body/estimate/v2 (") && done.stderr.contains(" closure, "),
-        "{done:?}"
-    );
+    assert!(done.code == Some(2) && done.says("other-layout"), "{done:?}");
+    for word in ["corotate/rigid-body/estimate/v1", "sum,", "corotate/rigid-body/estimate/v2", "closure,"] {
+        assert!(done.stderr.contains(word), "{word}: {done:?}");
+    }
 }
 
 #[test]

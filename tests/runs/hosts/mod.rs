@@ -247,7 +247,7 @@ fn a_joined_host_that_is_lost_before_the_ticks_ends_the_run() {
     assert_eq!(joined.wait().signal, Some(SIGKILL));
     let done = launched.wait();
     assert_eq!(done.code, Some(4), "{done:?}");
-    assert!(done.stderr.contains("sky") && done.stderr.contains("for 4 s"), "{done:?}");
+    assert!(done.says("no-answer") && done.stderr.contains("sky") && done.stderr.contains("4 s"), "{done:?}");
     // The next run on that site removes the files that the power cut left.
     let next = ["run", "rigid-pair", "--clock", "lockstep", "--duration", "0.1", UNJUDGED[0], UNJUDGED[1]];
     run.sites[1].bench.run(&next).succeeded();
@@ -349,8 +349,8 @@ fn an_interruption_beyond_the_timeout_ends_the_run_on_both_sides() {
     let (done, joined) = interrupt(&run, std::time::Duration::from_secs(10), &[]);
     assert_eq!((done.code, joined.code), (Some(4), Some(4)), "{done:?} {joined:?}");
     let summary = done.json();
-    let cause = summary["incidents"][0]["cause"].as_str().unwrap();
-    assert!(cause.contains("flight") && cause.contains("2 s"), "{cause}");
+    let (code, cause) = (&summary["incidents"][0]["code"], summary["incidents"][0]["cause"].as_str().unwrap());
+    assert!(code == "host-silent" && cause.contains("flight") && cause.contains("2 s"), "{code}: {cause}");
     assert!(joined.says("run-failed") && joined.stderr.contains("2 s"), "{}", joined.stderr);
     run.assert_clean();
 }
@@ -392,8 +392,10 @@ fn a_power_cut_on_either_host_ends_the_run_on_the_other() {
         run.sites[cut].cut_power();
         let (launched, joined) = (launched.wait(), joined.wait());
         if cut == 1 {
-            let cause = launched.json()["incidents"][0]["cause"].as_str().unwrap().to_owned();
-            assert!(cause.contains("flight") && cause.contains("1.5 s"), "{cause}");
+            let incident = launched.json()["incidents"][0].clone();
+            let cause = incident["cause"].as_str().unwrap();
+            assert!(incident["code"] == "host-silent", "{incident}");
+            assert!(cause.contains("flight") && cause.contains("1.5 s"), "{incident}");
             assert_eq!((launched.code, joined.signal), (Some(4), Some(SIGKILL)));
         } else {
             assert_eq!((launched.signal, joined.code), (Some(SIGKILL), Some(4)), "{joined:?}");
