@@ -705,7 +705,10 @@ fn in_a_browser_time_plots_show_values_and_zoom_together() {
     let parts: Vec<&str> = title.split('|').collect();
     let [readout, ticks, same, all] = parts[..] else { panic!("{title}") };
     // Because of the margins, the middle of the plot is a little before the middle of its axis.
-    assert!(readout.contains("4.6") && readout.contains("leader:") && readout.contains("observer:"), "{readout}");
+    assert!(
+        readout.starts_with("t = 4.6") && readout.contains("leader:") && readout.contains("observer:"),
+        "{readout}"
+    );
     let closer: Vec<f64> = ticks.split(' ').map(|tick| tick.parse().unwrap()).collect();
     assert!(closer.len() > 3 && closer[0] > 3.0 && closer[closer.len() - 1] < 6.5, "{ticks}");
     assert_eq!((same, all), ("true", "6"), "all plots zoom together, in and out");
