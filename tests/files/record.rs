@@ -14,6 +14,7 @@ use corotate::scenario::build;
 use corotate::telemetry::Ledger;
 use corotate::watch::Session;
 use libc::{SIGCONT, SIGKILL, SIGSTOP};
+use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
