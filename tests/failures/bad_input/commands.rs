@@ -229,7 +229,7 @@ fn check_prints_the_scenario_that_it_checked() {
         let claims: String =
             done.stdout.lines().map_while(|line| Some(format!("{}\n", line.strip_prefix("# ")?))).collect();
         assert_eq!(bench.run(&["check", path.to_str().unwrap()]).stdout, claims);
-        assert!(claims.starts_with(&format!("{name}: ")) && claims.lines().count() > 1, "{claims}");
+        assert!(claims.starts_with(&format!("{}: ", path.display())) && claims.lines().count() > 1, "{claims}");
         let resolved = Scenario::load(&path, &[]).unwrap().to_toml();
         assert_eq!(Scenario::parse(&done.stdout, name, &[]).unwrap().to_toml(), resolved);
         assert_eq!(Scenario::parse(&resolved, name, &[]).unwrap().to_toml(), resolved);
