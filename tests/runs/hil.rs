@@ -463,10 +463,10 @@ impl Drop for Partner {
 /// First tick at which partners misbehave.
 const BAD_TICK: u64 = 41;
 
-/// Returns the only line of stderr with the follower and this text.
-fn stall_line<'a>(done: &'a Done, text: &str) -> &'a str {
-    let lines: Vec<&str> =
-        done.stderr.lines().filter(|line| line.contains("follower") && line.contains(text)).collect();
+/// Returns the only line of stderr that has the follower and `text` after the prefix.
+fn follower_line<'a>(done: &'a Done, prefix: &str, text: &str) -> &'a str {
+    let found = |line: &&str| line.starts_with(prefix) && line.contains("follower") && line.contains(text);
+    let lines: Vec<&str> = done.stderr.lines().filter(found).collect();
     assert_eq!(lines.len(), 1, "{text}: {done:?}");
     lines[0]
 }
@@ -519,9 +519,12 @@ fn a_role_that_stalls_lockstep_is_named_with_its_missing_sample() {
         let (cause, missing) = (incident["cause"].as_str().unwrap(), format!("tick {tick}"));
         for word in [signal, &missing].iter().chain(found) {
             assert!(cause.contains(word), "{word}: {incident}");
-            assert!(stall_line(&done, "5 s").contains(word), "{word}: {done:?}");
+            assert!(follower_line(&done, "", "5 s").contains(word), "{word}: {done:?}");
         }
-        assert!(cause.contains("6 s") && stall_line(&done, "[waited-too-long]").contains(cause), "{done:?}");
+        assert!(
+            cause.contains("6 s") && follower_line(&done, "corotate: ", "[waited-too-long]").contains(cause),
+            "{done:?}"
+        );
         assert!(!done.stderr.contains("undisturbed") && done.stderr.contains("10001"), "{done:?}");
         assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
         let (name, failure) = junit_cases(&bench).remove(0);
@@ -558,8 +561,11 @@ fn an_external_role_that_never_connects_ends_the_run_at_the_timeout() {
     assert_eq!((&incident["role"], &incident["tick"]), (&"follower".into(), &0.into()), "{incident}");
     assert_eq!((&incident["code"], &incident["action"]), (&"waited-too-long".into(), &"stopped".into()), "{incident}");
     let cause = incident["cause"].as_str().unwrap();
-    assert!(cause.contains("8 s") && stall_line(&done, "[waited-too-long]").contains(cause), "{done:?}");
-    stall_line(&done, "5 s");
+    assert!(
+        cause.contains("8 s") && follower_line(&done, "corotate: ", "[waited-too-long]").contains(cause),
+        "{done:?}"
+    );
+    follower_line(&done, "", "5 s");
     assert!(junit_cases(&bench)[0].1.as_ref().is_some_and(|failure| failure.contains(cause)));
     bench.assert_clean(&domains);
 }
