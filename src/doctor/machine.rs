@@ -3,8 +3,8 @@
 //! All files lie below a root, so that a test can simulate a machine. Must not write; it only opens files that must be writable.
 
 use super::Check;
-use crate::config::Realtime;
-use crate::runtime::{RoleId, shared_memory_bytes};
+use crate::config::{Cores, Realtime};
+use crate::runtime::{CpuQuota, RoleId, cpu_quota, shared_memory_bytes};
 use crate::scenario::Scenario;
 use rustix::fs::statvfs;
 use std::fs::OpenOptions;
@@ -30,12 +30,14 @@ const FAST_CLOCKS: [&str; 5] =
 const SLOW_CLOCKS: [&str; 4] = ["hpet", "acpi_pm", "pit", "jiffies"];
 
 /// The demands of a run on the machine.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Demand {
     /// Number of processes that take part in a tick.
     pub roles: usize,
     /// Number of cores that this process may use.
     pub cores: usize,
+    /// The cores that the scenario names; empty if it names none.
+    pub named_cores: Vec<usize>,
     /// The SCHED_FIFO priority; 0 for none.
     pub priority: i32,
     /// Shared memory, bytes.
@@ -48,6 +50,7 @@ impl Demand {
         Self {
             roles: RoleId::all(scenario).len(),
             cores: std::thread::available_parallelism().map_or(1, usize::from),
+            named_cores: if let Cores::List(cores) = &scenario.realtime.cores { cores.clone() } else { Vec::new() },
             priority: scenario.realtime.priority,
             shared_memory: shared_memory_bytes(scenario) as u64,
         }
@@ -78,6 +81,9 @@ impl Machine {
             self.governor(),
             self.isolation(),
             cores(demand),
+            self.quota(),
+            self.siblings(demand),
+            self.interrupts(demand),
             self.load(demand.cores),
             self.clock_source(),
             self.shared_memory(demand.shared_memory),
@@ -253,6 +259,71 @@ impl Machine {
         }
     }
 
+    fn quota(&self) -> Check {
+        let name = "processor quota";
+        match cpu_quota(&self.root) {
+            None => Check::ok(name, "none"),
+            Some(CpuQuota { file, quota_us, period_us }) => {
+                let unlimited = if file.ends_with("cpu.max") { "max" } else { "-1" };
+                Check::bad(
+                    name,
+                    format!("{quota_us} of every {period_us} us: then all processes stop until the next period"),
+                    format!("`echo {unlimited} > {}`, or start from another cgroup", file.display()),
+                )
+            }
+        }
+    }
+
+    /// Returns the cores that the roles may use: those of the scenario, or those that this process may use.
+    fn cores_of_roles(&self, demand: &Demand) -> Vec<usize> {
+        let status = self.read("proc/self/status").unwrap_or_default();
+        let allowed = status.lines().find_map(|line| line.strip_prefix("Cpus_allowed_list:")).unwrap_or_default();
+        if demand.named_cores.is_empty() { core_list(allowed) } else { demand.named_cores.clone() }
+    }
+
+    fn siblings(&self, demand: &Demand) -> Check {
+        let name = "hardware threads";
+        let used = self.cores_of_roles(demand);
+        let pair = used.iter().find_map(|core| {
+            let path = format!("sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list");
+            let siblings = core_list(&self.read(&path)?);
+            siblings.into_iter().find(|sibling| sibling > core && used.contains(sibling)).map(|sibling| (core, sibling))
+        });
+        match pair {
+            None => Check::ok(name, "one per core, as far as roles use them"),
+            Some((core, sibling)) => Check::warn(
+                name,
+                format!("{core} and {sibling} share a core: a role on one slows a role on the other"),
+                "name one thread per core in realtime.cores, or `echo off > /sys/devices/system/cpu/smt/control`",
+            ),
+        }
+    }
+
+    /// Checks if the cores that the scenario names handle interrupts of devices. Without named cores the roles use all, and no
+    /// interrupt can be kept away.
+    fn interrupts(&self, demand: &Demand) -> Check {
+        let name = "device interrupts";
+        let numbers = std::fs::read_dir(self.root.join("proc/irq")).into_iter().flatten().flatten();
+        let numbers = numbers.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
+        let cores = |number: &u32| {
+            let path = |file: &str| format!("proc/irq/{number}/{file}");
+            let text = self.read(&path("effective_affinity_list")).or_else(|| self.read(&path("smp_affinity_list")));
+            core_list(&text.unwrap_or_default())
+        };
+        let mut met: Vec<u32> =
+            numbers.filter(|number| cores(number).iter().any(|core| demand.named_cores.contains(core))).collect();
+        met.sort_unstable();
+        match (demand.named_cores.is_empty(), met.first()) {
+            (true, _) => Check::ok(name, "on all cores: realtime.cores names none for the roles"),
+            (false, None) => Check::ok(name, "none on the cores of the roles"),
+            (false, Some(first)) => Check::warn(
+                name,
+                format!("{} on the cores of the roles, such as {first}: each one delays a role", met.len()),
+                format!("write other cores to /proc/irq/{first}/smp_affinity_list, and likewise for the others"),
+            ),
+        }
+    }
+
     fn load(&self, cores: usize) -> Check {
         let name = "load";
         let average = self.read("proc/loadavg").and_then(|text| text.split_whitespace().next()?.parse::<f64>().ok());
@@ -300,6 +371,17 @@ impl Machine {
     }
 }
 
+/// Reads a list of cores, such as `0-2,5`; a malformed part is left out.
+fn core_list(text: &str) -> Vec<usize> {
+    let part = |part: &str| {
+        let (first, last) = part.split_once('-').unwrap_or((part, part));
+        // No machine has more cores.
+        let [first, last] = [first.trim().parse().ok()?, last.trim().parse::<usize>().ok()?.min(8192)];
+        Some(first..=last)
+    };
+    text.split(',').filter_map(part).flatten().collect()
+}
+
 fn cores(demand: &Demand) -> Check {
     let (name, found) = ("cores", format!("{} for {} roles", demand.cores, demand.roles));
     let remedy = "roles that share a core wait for each other: give the run more cores, or lower tick_hz";
@@ -311,7 +393,7 @@ mod tests {
     use super::super::Verdict;
     use super::*;
 
-    const DEMAND: Demand = Demand { roles: 4, cores: 4, priority: 80, shared_memory: 1 };
+    const DEMAND: Demand = Demand { roles: 4, cores: 4, named_cores: Vec::new(), priority: 80, shared_memory: 1 };
 
     /// Creates a machine of these files.
     fn machine(files: &[(&str, &str)]) -> (tempfile::TempDir, Machine) {
@@ -457,5 +539,27 @@ mod tests {
         for name in ["virtual machine", "load", "cores", "cpufreq governor", "isolated cores"] {
             assert_eq!(verdict(name), Verdict::Warn, "{name}");
         }
+    }
+
+    #[test]
+    fn threads_of_one_core_and_interrupts_on_named_cores_are_reported() {
+        let (_root, machine) = machine(&[
+            ("proc/self/status", "Cpus_allowed_list:\t0-1,4\n"),
+            ("sys/devices/system/cpu/cpu0/topology/thread_siblings_list", "0,4\n"),
+            ("sys/devices/system/cpu/cpu4/topology/thread_siblings_list", "0,4\n"),
+            ("proc/irq/24/effective_affinity_list", "1\n"),
+            ("proc/irq/25/smp_affinity_list", "0-3\n"),
+            ("proc/irq/default_smp_affinity", "f\n"),
+            ("proc/irq/26/smp_affinity_list", "\u{1}-\n"),
+        ]);
+        let on = |named_cores: &[usize]| Demand { named_cores: named_cores.to_vec(), ..DEMAND };
+        let verdicts =
+            |named: &[usize]| [machine.siblings(&on(named)), machine.interrupts(&on(named))].map(|c| c.verdict);
+        assert_eq!(verdicts(&[]), [Verdict::Warn, Verdict::Ok]);
+        assert_eq!(verdicts(&[4]), [Verdict::Ok, Verdict::Ok]);
+        assert_eq!(verdicts(&[1, 2]), [Verdict::Ok, Verdict::Warn]);
+        assert!(machine.interrupts(&on(&[1])).found.starts_with("2 "));
+        assert_eq!(core_list("0-2,5,x,7-"), [0, 1, 2, 5]);
+        assert_eq!(core_list("0-18446744073709551615").len(), 8193);
     }
 }

@@ -1,6 +1,7 @@
-//! The real-time budget of a cgroup: where it is zero, the kernel refuses SCHED_FIFO even to root.
+//! The limits of a cgroup: a real-time budget of zero, with which the kernel refuses SCHED_FIFO even to root, and a quota of
+//! processor time.
 //!
-//! Must not change a budget.
+//! Must not change a limit.
 
 use std::fs;
 use std::path::{Component, Path, PathBuf};
@@ -27,20 +28,74 @@ pub fn grant_budgets(files: &[PathBuf]) -> String {
     commands.collect::<Vec<_>>().join("; ")
 }
 
+/// The limit of a cgroup on processor time: its tasks are stopped once they have used it, until the next period.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CpuQuota {
+    /// The file that sets it.
+    pub file: PathBuf,
+    /// Processor time per period, µs.
+    pub quota_us: u64,
+    /// The period, µs.
+    pub period_us: u64,
+}
+
+/// Returns the tightest limit on processor time of this process's cgroup and its parents (version 1 or 2), if there is one.
+pub fn cpu_quota(root: &Path) -> Option<CpuQuota> {
+    let read = |path: &Path| fs::read_to_string(root.join(path.strip_prefix("/").unwrap_or(path))).ok();
+    let [cgroups, mounts] =
+        ["/proc/self/cgroup", "/proc/self/mountinfo"].map(|path| read(Path::new(path)).unwrap_or_default());
+    let number = |path: &Path| read(path)?.trim().parse::<u64>().ok();
+    let old = cpu_groups(&cgroups, &mounts).into_iter().filter_map(|group| {
+        let file = group.join("cpu.cfs_quota_us");
+        Some(CpuQuota { quota_us: number(&file)?, period_us: number(&group.join("cpu.cfs_period_us"))?, file })
+    });
+    let unified = unified_groups(&cgroups, &mounts).into_iter().filter_map(|group| {
+        let file = group.join("cpu.max");
+        let text = read(&file)?;
+        let mut numbers = text.split_whitespace().map(|word| word.parse().ok());
+        Some(CpuQuota { quota_us: numbers.next()??, period_us: numbers.next()??, file })
+    });
+    let limits = old.chain(unified).filter(|limit| limit.period_us > 0);
+    limits.min_by(|a, b| {
+        (u128::from(a.quota_us) * u128::from(b.period_us)).cmp(&(u128::from(b.quota_us) * u128::from(a.period_us)))
+    })
+}
+
 /// Returns the budget files of the cgroups of controller `cpu` (version 1), outermost first. Version 2 has no budgets.
 fn find(cgroups: &str, mounts: &str) -> Vec<PathBuf> {
+    cpu_groups(cgroups, mounts).into_iter().map(|group| group.join("cpu.rt_runtime_us")).collect()
+}
+
+/// Returns the directories of the cgroups of controller `cpu` (version 1), outermost first.
+fn cpu_groups(cgroups: &str, mounts: &str) -> Vec<PathBuf> {
     let has_cpu = |list: &str| list.split(',').any(|name| name == "cpu");
+    groups(cgroups, mounts, has_cpu, |kind, options| kind == "cgroup" && has_cpu(options))
+}
+
+/// Returns the directories of the cgroups of version 2, outermost first.
+fn unified_groups(cgroups: &str, mounts: &str) -> Vec<PathBuf> {
+    groups(cgroups, mounts, str::is_empty, |kind, _| kind == "cgroup2")
+}
+
+/// Returns the directories of this process's cgroup and its parents, outermost first, by the controllers of its line and by the
+/// type and options of its mount.
+fn groups(
+    cgroups: &str,
+    mounts: &str,
+    is_group: impl Fn(&str) -> bool,
+    is_mount: impl Fn(&str, &str) -> bool,
+) -> Vec<PathBuf> {
     // "1:cpu,cpuacct:/path"
     let path = cgroups.lines().find_map(|line| {
         let (controllers, path) = line.split_once(':')?.1.split_once(':')?;
-        has_cpu(controllers).then_some(path)
+        is_group(controllers).then_some(path)
     });
     // "32 31 0:29 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu"
     let mount = mounts.lines().find_map(|line| {
         let (before, after) = line.split_once(" - ")?;
         let (mut before, mut after) = (before.split(' ').skip(3), after.split(' '));
         let (kind, options) = (after.next()?, after.nth(1)?);
-        (kind == "cgroup" && has_cpu(options)).then_some((before.next()?, before.next()?))
+        is_mount(kind, options).then_some((before.next()?, before.next()?))
     });
     let (Some(path), Some((top, mounted))) = (path, mount) else { return Vec::new() };
     // Groups above the mounted one cannot be read.
@@ -50,7 +105,7 @@ fn find(cgroups: &str, mounts: &str) -> Vec<PathBuf> {
     }
     let mut groups: Vec<&Path> = below.ancestors().collect();
     groups.reverse();
-    groups.into_iter().map(|group| Path::new(mounted).join(group).join("cpu.rt_runtime_us")).collect()
+    groups.into_iter().map(|group| Path::new(mounted).join(group)).collect()
 }
 
 #[cfg(test)]
@@ -91,6 +146,37 @@ mod tests {
     fn arbitrary_text_does_not_panic() {
         for (cgroups, mounts) in [("1:cpu:/", " - "), ("1:cpu:/", "a b c d e f - cgroup x"), ("::", "- - - -")] {
             let _ = find(cgroups, mounts);
+        }
+    }
+
+    #[test]
+    fn the_tightest_quota_of_both_versions_is_found() {
+        let quota = |cgroups: &str, files: &[(&str, &str)]| {
+            let root = tempfile::tempdir().unwrap();
+            let mounts = format!("{MOUNTS}40 31 0:40 / /sys/fs/cgroup/unified rw - cgroup2 cgroup2 rw,nsdelegate\n");
+            for (path, text) in [("proc/self/cgroup", cgroups), ("proc/self/mountinfo", &*mounts)].iter().chain(files) {
+                let path = root.path().join(path);
+                fs::create_dir_all(path.parent().unwrap()).unwrap();
+                fs::write(path, text).unwrap();
+            }
+            cpu_quota(root.path()).map(|found| (found.file.display().to_string(), found.quota_us, found.period_us))
+        };
+        let (old, unified) = ("sys/fs/cgroup/cpu", "sys/fs/cgroup/unified");
+        let at = |group: &str, file: &str| format!("{group}/{file}");
+        let [quota_file, period_file] = ["a/cpu.cfs_quota_us", "a/cpu.cfs_period_us"].map(|file| at(old, file));
+        let (maximum, parent) = (at(unified, "b/c/cpu.max"), at(unified, "b/cpu.max"));
+        assert_eq!(quota("4:cpu,cpuacct:/a\n0::/\n", &[(&quota_file, "-1\n"), (&period_file, "100000\n")]), None);
+        assert_eq!(
+            quota("4:cpu,cpuacct:/a\n0::/\n", &[(&quota_file, "20000\n"), (&period_file, "100000\n")]),
+            Some((format!("/{quota_file}"), 20_000, 100_000))
+        );
+        assert_eq!(quota("0::/b/c\n", &[(&maximum, "max 100000\n")]), None);
+        assert_eq!(
+            quota("0::/b/c\n", &[(&maximum, "50000 100000\n"), (&parent, "20000 50000\n")]),
+            Some((format!("/{parent}"), 20_000, 50_000))
+        );
+        for strange in ["", "9e9", "10000", "10000 0", "10000 -5", "\u{1}"] {
+            assert_eq!(quota("0::/b/c\n", &[(&maximum, strange)]), None, "{strange:?}");
         }
     }
 }

@@ -19,7 +19,7 @@ mod role_id;
 mod role_impl;
 mod sample_source;
 
-pub use budget::{empty_budgets, grant_budgets};
+pub use budget::{CpuQuota, cpu_quota, empty_budgets, grant_budgets};
 pub use device::{DeviceConfig, DeviceLink};
 pub use disturb::{Disturbance, Interruptions, LateSamples};
 pub use drive::{Backoff, Driver, Ended, LauncherLink, drive_in_turn, drive_in_turn_tracked, run_in_turn};
