@@ -185,7 +185,7 @@ fn every_command_refuses_a_damaged_file_and_reads_a_part_only_on_request() {
     assert!(code == Some(0) && full.starts_with(&part) && part.lines().count() > 100, "{} rows", part.lines().count());
     let page = |file: &Path| bench.run(&["report", file.to_str().unwrap(), "--out", "page.html"]);
     let done = page(&wrong);
-    assert!(done.code == Some(1) && done.says("damaged-recording") && bench.path("page.html").exists(), "{done:?}");
+    assert!(done.code == Some(1) && done.stderr.contains("damaged") && bench.path("page.html").exists(), "{done:?}");
     // Damaged metadata: a digit of the period, and a letter of the scenario.
     for (text, digit) in [("period_ns", 13), ("decay_rate", 0)] {
         let at = bytes.windows(text.len()).position(|window| window == text.as_bytes());

@@ -443,13 +443,11 @@ fn bad_input_is_refused_without_a_panic() {
         assert!(!done.stderr.contains("panicked"), "{done:?}");
     }
     let schema = summary_in(&directory).to_string().replace("summary/v1", "summary/v9");
-    for (text, code, word) in [
-        (schema.as_str(), "other-schema", "summary/v9"),
-        ("{", "unreadable-summary", "EOF"),
-        ("{\"schema\":\"corotate/summary/v1\"}", "unreadable-summary", "missing"),
-    ] {
+    for (text, word) in
+        [(schema.as_str(), "summary/v9"), ("{", "EOF"), ("{\"schema\":\"corotate/summary/v1\"}", "missing")]
+    {
         std::fs::write(directory.join("summary.json"), text).unwrap();
-        assert_refused(&directory, code, &["summary.json", word]);
+        assert_refused(&directory, "unreadable-summary", &["summary.json", word]);
     }
     let done = report(&bench, &directory.join("run.mcap"), &["--out", "no/such/directory/page.html"]);
     assert!(done.code == Some(1) && done.says("cannot-write") && done.stderr.contains("--out"), "{done:?}");
