@@ -177,7 +177,7 @@ fn bench_measures_the_own_scenario_without_targets() {
         ("tick", "rate error of a run"),
         ("lockstep", "lockstep"),
         ("lockstep", "in one thread, motor-pair"),
-        ("lockstep", "arithmetic alone, motor-pair"),
+        ("lockstep", "the roles alone, motor-pair"),
         ("overhead", "page faults, follower"),
         ("overhead", "allocations beyond iceoryx2's one per sample, worst role"),
     ] {
