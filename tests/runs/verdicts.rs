@@ -58,7 +58,7 @@ fn a_number_limits_all_ticks_and_a_percentage_excludes_injected_ones() {
 fn a_stall_breaks_the_limit_on_the_age_but_not_on_the_step() {
     const STALL_US: f64 = 80_000.0;
     let run = |role: &str, accept: &str| {
-        let fault = format!(r#"--set=fault=[{{kind="stall", role="{role}", from_tick=100, ms=80}}]"#);
+        let fault = format!(r#"--set=fault=[{{kind="stall", role="{role}", from_tick=100, stall_ms=80}}]"#);
         let accept = format!("--set=accept={{missed_ticks_max={{}}, starved_ticks_max={{}}, {accept}}}");
         let rate = ["--clock=realtime", "--tick-hz=100", "--duration=2", "--json"];
         Bench::new().run(&[&["run", "rigid-pair"], &rate[..], &[&fault, &accept]].concat())

@@ -117,7 +117,7 @@ fn rows_of_whole_runs_measure_their_floors() {
         ("lockstep", "lockstep"),
         ("lockstep", "two raw hops back to back"),
         ("lockstep", "in one thread, rigid-pair"),
-        ("lockstep", "arithmetic alone, rigid-pair"),
+        ("lockstep", "the roles alone, rigid-pair"),
         ("run", "start to first tick"),
         ("run", "bare iceoryx2 node"),
         ("run", "memory of observer"),
