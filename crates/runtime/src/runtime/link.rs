@@ -183,6 +183,43 @@ mod tests {
         assert_eq!((read.received, read.gaps, read.stale, read.last_tick), (4, 2, 2, Some(5)));
     }
 
+    /// Opens a reading end that recovers samples from the writer's ledger.
+    fn recovering_input(bus: &MemoryBus, ledger: &Ledger, generation: u64) -> Input<MemoryBus, RateCommand> {
+        let shared = ledger.reopened();
+        shared.take(EXTENT.words(WORDS) - RetainedSamples::words(EXTENT.retained_samples, WORDS));
+        let retained = RetainedSamples::open(&shared, EXTENT.retained_samples, WORDS);
+        let input = Input::<_, RateCommand>::open(bus, &topic(), Reader::Role).unwrap();
+        let mut input = input.with_recovery(retained, 1, generation > 1);
+        input.expect(AcceptedTicks::Next);
+        input
+    }
+
+    #[test]
+    fn samples_of_a_writer_that_ended_before_the_reader_connected_are_received() {
+        let directory = tempfile::tempdir().unwrap();
+        let ledger = Ledger::shared(&directory.path().join("x.books"), EXTENT.words(WORDS)).unwrap();
+        let depths = Depths { role: 100, scorer: 100, history: 0 };
+        let (unconnected, bus) = (MemoryBus::new(depths), MemoryBus::new(depths));
+        let mut first = output(&unconnected, &ledger, 1);
+        for tick in [0, 1] {
+            first.send(|sample| sample.stamp.tick = tick).unwrap();
+        }
+        let mut committed = Store(Vec::new());
+        first.persist(&mut committed);
+        drop(first);
+        let mut input = recovering_input(&bus, &ledger, 1);
+        let mut successor = output(&bus, &ledger, 2);
+        successor.persist(&mut StoredWords(&committed.0));
+        successor.dispatch().unwrap();
+        successor.finish().unwrap();
+        successor.send(|sample| sample.stamp.tick = 2).unwrap();
+        for tick in [0, 1, 2] {
+            assert_eq!(input.seek(tick).unwrap(), Seek::Found, "{tick}");
+        }
+        let read = input.counters().report("");
+        assert_eq!((read.received, read.gaps, read.stale), (3, 0, 0));
+    }
+
     /// Twenty ticks on a link with delays, duplicates and drops. Reader or writer dies at one tick.
     #[derive(Debug, Default)]
     struct Course {
@@ -228,15 +265,7 @@ mod tests {
                 let faults = Disturbance::for_signal(&scenario, "controller", "follower", 1, next_tick);
                 output(&sends, &ledger, generation).with_markers(true).disturbed(faults)
             };
-            let reader = |bus: &MemoryBus, generation| {
-                let shared = ledger.reopened();
-                shared.take(EXTENT.words(WORDS) - RetainedSamples::words(EXTENT.retained_samples, WORDS));
-                let retained = RetainedSamples::open(&shared, EXTENT.retained_samples, WORDS);
-                let input = Input::<_, RateCommand>::open(bus, &topic(), Reader::Role).unwrap();
-                let mut input = input.with_recovery(retained, 1, generation > 1);
-                input.expect(AcceptedTicks::Next);
-                input
-            };
+            let reader = |bus: &MemoryBus, generation| recovering_input(bus, &ledger, generation);
             let (mut output, mut input, mut seen) = (writer(1, 0), reader(&brings, 1), Vec::new());
             for tick in 0..20 {
                 let fill = |sample: &mut RateCommand| {

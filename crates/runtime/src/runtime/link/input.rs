@@ -212,8 +212,9 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             return Ok(false);
         }
         let Some(stamp) = self.port.current().map(|sample| *sample.stamp()) else { return Ok(false) };
+        let generation = stamp.generation & !NO_SAMPLE;
         if let Some(recovery) = &mut self.recovery
-            && self.last.is_some_and(|(_, known)| stamp.generation & !NO_SAMPLE != known)
+            && self.last.map_or(generation > 1, |(_, known)| generation != known)
             && !stamp.is_warm_up()
         {
             self.newest = Newest::None;
