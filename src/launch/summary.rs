@@ -45,6 +45,9 @@ pub struct Summary {
     pub tick_hz: f64,
     /// The last tick of the scenario.
     pub last_tick: u64,
+    /// In real time, the limit beyond which an executed tick counts as late, µs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub late_us: Option<f64>,
     /// The time at which it was started.
     pub started_utc: String,
     /// The machine.
@@ -172,6 +175,8 @@ impl Summary {
             clock: scenario.clock.name().to_owned(),
             tick_hz: 1e9 / scenario.period_ns as f64,
             last_tick: scenario.last_tick,
+            late_us: (scenario.clock == ClockKind::Realtime)
+                .then(|| scenario.realtime.late_ns(scenario.period_ns) as f64 / 1e3),
             started_utc: utc(started),
             host: MachineInfo::local(),
             hosted: hosted(scenario),

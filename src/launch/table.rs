@@ -245,6 +245,11 @@ fn counters(summary: &Summary, all: bool, text: &mut String) {
         summary.score.scored_ticks,
         summary.score.scored_ticks + summary.score.unscored_ticks,
     );
+    let late = books.roles.iter().filter(|(_, ticks)| ticks.late > 0);
+    let late: Vec<String> = late.map(|(role, ticks)| format!("{role} {}", ticks.late)).collect();
+    if let Some(late_us) = summary.late_us.filter(|_| !late.is_empty()) {
+        let _ = writeln!(text, "ticks late by more than {} us: {}", digits(late_us), late.join(", "));
+    }
     if books.injected_faults > 0 {
         let _ = writeln!(text, "scripted faults: acted {} times", books.injected_faults);
     }

@@ -190,13 +190,14 @@ pub fn figures_cells(figures: &Percentiles) -> [String; 6] {
 }
 
 fn ticks_row((role, ticks): (&String, &Ticks)) -> Vec<String> {
-    strings(&[role, &ticks.elapsed, &ticks.executed, &ticks.missed, &ticks.starved, &ticks.safe, &ticks.stalled])
+    let Ticks { elapsed, executed, missed, starved, late, safe, stalled, .. } = ticks;
+    strings(&[role, elapsed, executed, missed, starved, late, safe, stalled])
 }
 
 /// Builds the section with the counters of roles, links, hosts and the recording.
 pub fn books(source: &Source) -> Section {
     let mut blocks = Vec::new();
-    let roles = ["role", "elapsed", "executed", "missed", "starved", "safe", "stalled"];
+    let roles = ["role", "elapsed", "executed", "missed", "starved", "late", "safe", "stalled"];
     if let Some(books) = source.summary.as_ref().map(|summary| &summary.books) {
         let balance = if books.balanced { "The counters balance." } else { "THE COUNTERS DO NOT BALANCE." };
         let scripted = !faults(source).is_empty() || books.injected_faults > 0;

@@ -73,6 +73,7 @@ fn a_stall_breaks_the_limit_on_the_age_but_not_on_the_step() {
         assert!(age["value"].as_f64().unwrap() >= STALL_US - 10_000.0, "{age}");
         assert!(late.iter().any(|late| age["role"] == *late), "{age}");
         assert_eq!(age["holds"], false, "{age}");
+        assert_eq!(summary["late_us"], 1000.0, "a tenth of the period");
         let late_ticks = criterion(&summary, "late_ticks_max");
         assert!(late_ticks["value"].as_f64().unwrap() >= 1.0 && late_ticks["holds"] == false, "{late_ticks}");
         for kept in ["step_latency_p99_us_max", "age_p999_us_max", "lateness_max_us"] {
