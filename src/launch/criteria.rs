@@ -277,9 +277,12 @@ impl Judge<'_> {
             ("safe_ticks_max", &accept.safe_ticks_max, |role| role.safe, Some(TickAmount::Share(0.0))),
             ("late_ticks_max", &accept.late_ticks_max, |role| role.late, None),
         ] {
-            // Without real time no tick is late.
-            let reason =
-                (name == "late_ticks_max" && self.scenario.clock != ClockKind::Realtime).then_some(Unjudged::Clock);
+            // Without real time no tick is late, and an external role may not count late ticks.
+            let reason = match name == "late_ticks_max" {
+                true if self.scenario.clock != ClockKind::Realtime => Some(Unjudged::Clock),
+                true if roles.iter().any(|role| role.late.is_none()) => Some(Unjudged::Unbooked),
+                _ => None,
+            };
             match limit {
                 // As in older scenarios: the sum over all roles.
                 Some(TickLimit::All(TickAmount::Count(limit))) if name == "missed_ticks_max" => {
@@ -288,14 +291,16 @@ impl Judge<'_> {
                     criteria.push(Criterion::new(name, *limit as f64, Some(all as f64)));
                 }
                 Some(TickLimit::All(amount)) => {
-                    let worst = worst(name, &roles, count, |ticks| granted(*amount, ticks));
+                    let unknown = || reason.is_some().then(|| Criterion::new(name, granted(*amount, 0) as f64, None));
+                    let worst = worst(name, &roles, count, |ticks| granted(*amount, ticks)).or_else(unknown);
                     criteria.extend(worst.map(|criterion| criterion.unless(reason)));
                 }
                 Some(TickLimit::ByRole(by_role)) => criteria.extend(by_role.iter().map(|(role, amount)| {
                     let counted = roles.iter().find(|counted| counted.role == role);
                     let value = counted.and_then(count).map(|ticks| ticks as f64);
                     let limit = granted(*amount, counted.map_or(0, |counted| counted.elapsed)) as f64;
-                    let reason = if value.is_none() { Some(Unjudged::Unbooked) } else { reason.clone() };
+                    let clock = reason.clone().filter(|reason| *reason == Unjudged::Clock);
+                    let reason = if value.is_none() { Some(Unjudged::Unbooked) } else { clock };
                     Criterion::new(format!("{name}.{role}"), limit, value).unless(reason)
                 })),
                 None => {
@@ -317,7 +322,7 @@ impl Judge<'_> {
     fn roles(&self) -> Vec<Counted<'_>> {
         let booked = self.books.roles.iter().map(|(role, ticks)| {
             let Ticks { elapsed, missed, starved, safe, late, .. } = *ticks;
-            let late = Some(missed + starved + late);
+            let late = late.map(|late| missed + starved + late);
             Counted { role, elapsed, missed: Some(missed), starved: Some(starved), safe: Some(safe), late }
         });
         let elapsed = self.elapsed();
@@ -498,6 +503,28 @@ mod tests {
             }
             let (found, _, criteria) = judged(overrides, |outcome| ticks(outcome, "follower").safe = 1);
             assert_eq!((found, broken(&criteria)), (Some(false), vec![("safe_ticks_max", Some("follower"))]));
+        }
+    }
+
+    /// An external role may keep counters without late ticks.
+    #[test]
+    fn late_ticks_are_not_judged_of_a_role_that_does_not_count_them() {
+        let overrides = |clock: &str, accept: &str| [format!("clock={clock}"), format!("accept={{{accept}}}")];
+        let scenario = |clock, accept| Scenario::parse(SHIPPED[0].1, "test", &overrides(clock, accept)).unwrap();
+        let signal = AtomicUsize::new(0);
+        let mut outcome = run(&scenario("in-process", ""), &mut Launch::new(&signal, &mut |_| {})).unwrap();
+        (ticks(&mut outcome, "observer").late, ticks(&mut outcome, "follower").late) = (Some(6), None);
+        for (accept, name, role, holds) in [
+            ("late_ticks_max=5", "late_ticks_max", Some("observer"), Some(false)),
+            ("late_ticks_max=6", "late_ticks_max", Some("observer"), None),
+            ("late_ticks_max={observer=6}", "late_ticks_max.observer", None, Some(true)),
+            ("late_ticks_max={follower=6}", "late_ticks_max.follower", None, None),
+        ] {
+            let criteria = Judged::new(&scenario("realtime", accept), &outcome).criteria;
+            let criterion = criteria.iter().find(|criterion| criterion.name == name).unwrap();
+            assert_eq!((criterion.role.as_deref(), criterion.holds), (role, holds), "{accept}");
+            let reason = holds.is_none().then_some(Unjudged::Unbooked);
+            assert_eq!(criterion.reason, reason, "{accept}");
         }
     }
 

@@ -245,10 +245,12 @@ fn counters(summary: &Summary, all: bool, text: &mut String) {
         summary.score.scored_ticks,
         summary.score.scored_ticks + summary.score.unscored_ticks,
     );
-    let late = books.roles.iter().filter(|(_, ticks)| ticks.late > 0);
-    let late: Vec<String> = late.map(|(role, ticks)| format!("{role} {}", ticks.late)).collect();
-    if let Some(late_us) = summary.late_us.filter(|_| !late.is_empty()) {
-        let _ = writeln!(text, "ticks late by more than {} us: {}", digits(late_us), late.join(", "));
+    let late = books.roles.iter().filter_map(|(role, ticks)| Some((role, ticks.late.filter(|late| *late > 0)?)));
+    let late: Vec<(&String, u64)> = late.collect();
+    if let (Some(late_us), Some((role, most))) = (summary.late_us, late.iter().max_by_key(|(_, ticks)| *ticks)) {
+        let _ = write!(text, "ticks late by more than {} us: ", digits(late_us));
+        let by_role = || late.iter().map(|(role, ticks)| format!("{role} {ticks}")).collect::<Vec<_>>().join(", ");
+        let _ = if all { writeln!(text, "{}", by_role()) } else { writeln!(text, "at most {most}, at {role}") };
     }
     if books.injected_faults > 0 {
         let _ = writeln!(text, "scripted faults: acted {} times", books.injected_faults);

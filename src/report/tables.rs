@@ -191,7 +191,8 @@ pub fn figures_cells(figures: &Percentiles) -> [String; 6] {
 
 fn ticks_row((role, ticks): (&String, &Ticks)) -> Vec<String> {
     let Ticks { elapsed, executed, missed, starved, late, safe, stalled, .. } = ticks;
-    strings(&[role, elapsed, executed, missed, starved, late, safe, stalled])
+    let late = late.map_or_else(|| "–".to_owned(), |late| late.to_string());
+    strings(&[role, elapsed, executed, missed, starved, &late, safe, stalled])
 }
 
 /// Builds the section with the counters of roles, links, hosts and the recording.

@@ -159,7 +159,7 @@ impl<'a, R: Rig> Run<'a, R> {
         });
         RoleReport {
             role: role.name(self.scenario).to_owned(),
-            ticks: Ticks { elapsed: ticks, executed: ticks, ..Ticks::default() },
+            ticks: Ticks { elapsed: ticks, executed: ticks, late: Some(0), ..Ticks::default() },
             written: written.collect(),
             read: read.collect(),
             watchdog: None,

@@ -100,7 +100,7 @@ impl TickCounters {
             executed: self.executed,
             missed: self.missed,
             starved: self.starved,
-            late: self.late,
+            late: Some(self.late),
             safe: self.safe,
             stalled: self.stalled,
             scripted: self.scripted,

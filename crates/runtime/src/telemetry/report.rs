@@ -87,9 +87,9 @@ pub struct Ticks {
     #[serde(default)]
     pub starved: u64,
     /// Executed ticks with all inputs that were late: a body's lateness, or the age of an estimate or command, was above
-    /// `realtime.late_us`.
-    #[serde(default)]
-    pub late: u64,
+    /// `realtime.late_us`. `None` if an external role does not count them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub late: Option<u64>,
     /// Ticks at which a plant applied its safe command.
     #[serde(default)]
     pub safe: u64,
