@@ -351,7 +351,7 @@ impl HubSession {
         })
     }
 
-    /// Requests the time. Returns the answer, an encoded [`Message`].
+    /// Requests the time. Returns the answer, an encoded `Message`.
     ///
     /// # Errors
     /// [`NetError::Silent`], [`NetError::Engine`].
