@@ -81,7 +81,7 @@ impl Machine {
             self.governor(),
             self.isolation(),
             cores(demand),
-            self.quota(),
+            self.quota(demand),
             self.siblings(demand),
             self.interrupts(demand),
             self.load(demand.cores),
@@ -259,19 +259,20 @@ impl Machine {
         }
     }
 
-    fn quota(&self) -> Check {
+    /// The kernel does not apply a quota to tasks with SCHED_FIFO, but launcher and recorder have none.
+    fn quota(&self, demand: &Demand) -> Check {
         let name = "processor quota";
-        match cpu_quota(&self.root) {
-            None => Check::ok(name, "none"),
-            Some(CpuQuota { file, quota_us, period_us }) => {
-                let unlimited = if file.ends_with("cpu.max") { "max" } else { "-1" };
-                Check::bad(
-                    name,
-                    format!("{quota_us} of every {period_us} us: then all processes stop until the next period"),
-                    format!("`echo {unlimited} > {}`, or start from another cgroup", file.display()),
-                )
-            }
+        let Some(CpuQuota { file, quota_us, period_us }) = cpu_quota(&self.root) else {
+            return Check::ok(name, "none found");
+        };
+        let found = format!("{quota_us} us of processor time in every {period_us} us");
+        if quota_us >= period_us.saturating_mul(demand.cores as u64) {
+            return Check::ok(name, format!("{found}: as much as the cores have"));
         }
+        let found = format!("{found}: once it is used, processes without SCHED_FIFO stop until the next period");
+        let unlimited = if file.ends_with("cpu.max") { "max" } else { "-1" };
+        let remedy = format!("`echo {unlimited} > {}`, or start from another cgroup", file.display());
+        if demand.priority > 0 { Check::warn(name, found, remedy) } else { Check::bad(name, found, remedy) }
     }
 
     /// Returns the cores that the roles may use: those of the scenario, or those that this process may use.
@@ -284,13 +285,17 @@ impl Machine {
     fn siblings(&self, demand: &Demand) -> Check {
         let name = "hardware threads";
         let used = self.cores_of_roles(demand);
-        let pair = used.iter().find_map(|core| {
+        let siblings = |core: &usize| {
             let path = format!("sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list");
-            let siblings = core_list(&self.read(&path)?);
-            siblings.into_iter().find(|sibling| sibling > core && used.contains(sibling)).map(|sibling| (core, sibling))
-        });
-        match pair {
-            None => Check::ok(name, "one per core, as far as roles use them"),
+            self.read(&path).map(|list| (*core, core_list(&list)))
+        };
+        let known: Vec<(usize, Vec<usize>)> = used.iter().filter_map(siblings).collect();
+        let shared = |(core, siblings): &(usize, Vec<usize>)| {
+            siblings.iter().find(|sibling| *sibling > core && used.contains(sibling)).map(|sibling| (*core, *sibling))
+        };
+        match known.iter().find_map(shared) {
+            None if known.len() < used.len() || used.is_empty() => Check::ok(name, "unknown"),
+            None => Check::ok(name, "one per core, of those that roles use"),
             Some((core, sibling)) => Check::warn(
                 name,
                 format!("{core} and {sibling} share a core: a role on one slows a role on the other"),
@@ -303,8 +308,8 @@ impl Machine {
     /// interrupt can be kept away.
     fn interrupts(&self, demand: &Demand) -> Check {
         let name = "device interrupts";
-        let numbers = std::fs::read_dir(self.root.join("proc/irq")).into_iter().flatten().flatten();
-        let numbers = numbers.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
+        let Ok(numbers) = std::fs::read_dir(self.root.join("proc/irq")) else { return Check::ok(name, "unknown") };
+        let numbers = numbers.flatten().filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
         let cores = |number: &u32| {
             let path = |file: &str| format!("proc/irq/{number}/{file}");
             let text = self.read(&path("effective_affinity_list")).or_else(|| self.read(&path("smp_affinity_list")));
@@ -318,7 +323,7 @@ impl Machine {
             (false, None) => Check::ok(name, "none on the cores of the roles"),
             (false, Some(first)) => Check::warn(
                 name,
-                format!("{} on the cores of the roles, such as {first}: each one delays a role", met.len()),
+                format!("{} may come on the cores of the roles, such as {first}, and delay them", met.len()),
                 format!("write other cores to /proc/irq/{first}/smp_affinity_list, and likewise for the others"),
             ),
         }
@@ -546,6 +551,7 @@ mod tests {
         let (_root, machine) = machine(&[
             ("proc/self/status", "Cpus_allowed_list:\t0-1,4\n"),
             ("sys/devices/system/cpu/cpu0/topology/thread_siblings_list", "0,4\n"),
+            ("sys/devices/system/cpu/cpu1/topology/thread_siblings_list", "1\n"),
             ("sys/devices/system/cpu/cpu4/topology/thread_siblings_list", "0,4\n"),
             ("proc/irq/24/effective_affinity_list", "1\n"),
             ("proc/irq/25/smp_affinity_list", "0-3\n"),
@@ -559,7 +565,21 @@ mod tests {
         assert_eq!(verdicts(&[4]), [Verdict::Ok, Verdict::Ok]);
         assert_eq!(verdicts(&[1, 2]), [Verdict::Ok, Verdict::Warn]);
         assert!(machine.interrupts(&on(&[1])).found.starts_with("2 "));
+        let threads = |named: &[usize]| machine.siblings(&on(named)).found;
+        assert!(threads(&[0, 1]) != "unknown" && threads(&[1, 2]) == "unknown", "core 2 has no file");
         assert_eq!(core_list("0-2,5,x,7-"), [0, 1, 2, 5]);
         assert_eq!(core_list("0-18446744073709551615").len(), 8193);
+    }
+
+    /// The kernel applies a quota to tasks without SCHED_FIFO only, and one of all cores limits nothing.
+    #[test]
+    fn a_quota_is_bad_only_where_it_stops_the_roles() {
+        let (_root, machine) = machine(&[
+            ("proc/self/cgroup", "0::/a\n"),
+            ("proc/self/mountinfo", "40 31 0:40 / /sys/fs/cgroup rw - cgroup2 cgroup2 rw\n"),
+            ("sys/fs/cgroup/a/cpu.max", "200000 100000\n"),
+        ]);
+        let verdict = |priority, cores| machine.quota(&Demand { priority, cores, ..DEMAND }).verdict;
+        assert_eq!([verdict(80, 4), verdict(0, 4), verdict(0, 2)], [Verdict::Warn, Verdict::Bad, Verdict::Ok]);
     }
 }

@@ -248,9 +248,9 @@ fn counters(summary: &Summary, all: bool, text: &mut String) {
     let late = books.roles.iter().filter_map(|(role, ticks)| Some((role, ticks.late.filter(|late| *late > 0)?)));
     let late: Vec<(&String, u64)> = late.collect();
     if let (Some(late_us), Some((role, most))) = (summary.late_us, late.iter().max_by_key(|(_, ticks)| *ticks)) {
-        let _ = write!(text, "ticks late by more than {} us: ", digits(late_us));
+        let _ = write!(text, "executed ticks late by more than {} us: ", digits(late_us));
         let by_role = || late.iter().map(|(role, ticks)| format!("{role} {ticks}")).collect::<Vec<_>>().join(", ");
-        let _ = if all { writeln!(text, "{}", by_role()) } else { writeln!(text, "at most {most}, at {role}") };
+        let _ = if all { writeln!(text, "{}", by_role()) } else { writeln!(text, "most at {role}, {most}") };
     }
     if books.injected_faults > 0 {
         let _ = writeln!(text, "scripted faults: acted {} times", books.injected_faults);

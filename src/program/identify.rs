@@ -45,7 +45,7 @@ enum Method {
     Tensor,
     /// The papers' recursive filter
     Recursive,
-    /// The same filter for a body symmetric about --symmetry-axis
+    /// The papers' filter for a body symmetric about --symmetry-axis
     Axisymmetric,
 }
 

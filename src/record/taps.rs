@@ -120,7 +120,7 @@ impl Tap {
             }
             let now_ns = monotonic_ns();
             let max_tick = match context.realtime.then(|| context.grid.tick_at(now_ns)) {
-                // Who joins a run in lockstep may have lost samples.
+                // A reader that joined a run in lockstep may have missed samples.
                 None if context.joined.is_some() => context.last_tick,
                 due_tick => order.max_tick(due_tick, context.last_tick),
             };
