@@ -8,7 +8,7 @@ use super::exchange::{Mechanism, Opening, Receiver, Sender, Station, Wake};
 use super::peer::{LOST_NS, Peer, SPIN_NS, lead_ns};
 use super::session::{Bench, BenchError};
 use crate::bus::domain::{Domain, OwnedDomain};
-use crate::clock::{Grid, monotonic_ns, wait_until};
+use crate::clock::{Grid, SpinGap, monotonic_ns, wait_until};
 use crate::telemetry::{Grant, Latency};
 
 /// The pace of the open loop: 1 kHz.
@@ -163,7 +163,7 @@ pub(super) fn send_paced(
 ) -> Result<(), BenchError> {
     let (before, mut tick) = (*number, 1);
     while tick <= count {
-        let now_ns = wait_until(grid.due_ns(tick), lead_ns(grid));
+        let now_ns = wait_until(grid.due_ns(tick), lead_ns(grid), &mut SpinGap::default());
         // As in a role, late ticks are skipped, never sent in a burst. The receiver counts the missing numbers.
         tick = grid.tick_at(now_ns).clamp(tick, count);
         sender.send(before + tick, grid.due_ns(tick))?;

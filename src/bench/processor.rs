@@ -6,7 +6,7 @@
 use super::board::Board;
 use super::session::{Bench, BenchError};
 use super::watch::{Process, Watch};
-use crate::clock::{Grid, monotonic_ns, wait_until};
+use crate::clock::{Grid, SpinGap, monotonic_ns, wait_until};
 use rustix::time::{ClockId, clock_gettime};
 use std::fs;
 use std::time::{Duration, Instant};
@@ -73,7 +73,7 @@ fn bare(bench: &Bench<'_>, board: &mut Board, ticks: u64, lead_ns: u64) -> Resul
         let grid = Grid { epoch_ns: monotonic_ns() + PERIOD_NS, period_ns: PERIOD_NS };
         let before = clock_gettime(ClockId::ThreadCPUTime);
         for tick in 0..ticks {
-            wait_until(grid.due_ns(tick), lead_ns);
+            wait_until(grid.due_ns(tick), lead_ns, &mut SpinGap::default());
         }
         let after = clock_gettime(ClockId::ThreadCPUTime);
         let ns = (after.tv_sec - before.tv_sec) * 1_000_000_000 + after.tv_nsec - before.tv_nsec;

@@ -4,7 +4,7 @@ use super::board::Board;
 use super::chain::{APART, run_live, stages};
 use super::session::{Bench, BenchError};
 use super::watch::Watch;
-use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
+use crate::clock::{Grid, SpinGap, monotonic_ns, sleep_until, wait_until};
 use crate::runtime::RoleId;
 use crate::telemetry::{Grant, Latency};
 use std::process::{Command, Stdio};
@@ -59,7 +59,7 @@ fn bare(bench: &Bench<'_>, board: &mut Board, ticks: u64, lead_ns: u64) -> Resul
                     sleep_until(due_ns);
                     monotonic_ns()
                 }
-                lead_ns => wait_until(due_ns, lead_ns),
+                lead_ns => wait_until(due_ns, lead_ns, &mut SpinGap::default()),
             };
             first_ns = if tick == 0 { last_ns } else { first_ns };
             latency.record(due_ns, last_ns);

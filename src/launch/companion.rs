@@ -7,6 +7,7 @@ use super::children::{RoleProcess, program};
 use super::incident::RoleFailure;
 use super::janitor::Janitor;
 use crate::system::tell;
+use rustix::process::{Pid, Signal, kill_process};
 use std::path::Path;
 use std::process::Command;
 
@@ -73,6 +74,14 @@ impl Companion {
         tell(format_args!("corotate: {} failed: {cause}; the run goes on without [companion-lost]", self.name));
         janitor.clear_dead();
         Some(cause)
+    }
+
+    /// Asks the process to end.
+    pub fn stop(&mut self) {
+        let running = self.process.as_mut().and_then(|process| process.ended().is_none().then(|| process.pid()));
+        if let Some(pid) = running.and_then(Pid::from_raw) {
+            let _ = kill_process(pid, Signal::TERM);
+        }
     }
 
     /// Returns true while the process runs.

@@ -40,6 +40,7 @@ fn run_directly(scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome>
     let (reports, score) = scenario.rig.direct(scenario, checkpoints, &mut go_on)?;
     let signal = if stopped { launch.signal.load(Ordering::Relaxed) } else { 0 };
     Some(Outcome {
+        late: None,
         reports,
         recording: None,
         unbooked: Vec::new(),
@@ -126,6 +127,7 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
         recorder.finish(&reports, last.as_ref())
     });
     Ok(Outcome {
+        late: None,
         reports,
         recording,
         unbooked: Vec::new(),

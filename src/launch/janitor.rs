@@ -9,7 +9,8 @@ use super::LaunchError;
 use crate::bus::domain::{self, Domain};
 use crate::bus::iox;
 use crate::clock::monotonic_ns;
-use crate::system::{tell, this_program};
+use crate::late::remove_dead_traces;
+use crate::system::{name_thread, tell, this_program};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 use std::fs::{self, Metadata};
@@ -163,6 +164,7 @@ pub fn janitor(
     mut line: impl Read + AsFd,
     mut answers: impl Write,
 ) -> io::Result<()> {
+    name_thread("janitor");
     let swept = domain.clone();
     // Beside the clean-up, which waits for unfinished files itself. The thread ends with the process.
     std::thread::Builder::new().spawn(move || sweep(&swept, limit))?;
@@ -192,6 +194,7 @@ pub fn janitor(
         std::thread::sleep(Duration::from_millis(pause_ms));
         gone.iter().for_each(Domain::remove_if_over);
         gone.extend(domain::remove_dead_domains().unwrap_or_default());
+        remove_dead_traces();
     }
     Ok(())
 }

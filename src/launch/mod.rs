@@ -28,6 +28,7 @@ mod summary;
 mod supervision;
 mod table;
 mod trace;
+mod tracer;
 
 pub use crate::score::{CertificateScore, MetricScore, Score, Scorer};
 pub use criteria::{Criterion, Unjudged, tick_words};

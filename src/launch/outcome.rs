@@ -7,6 +7,7 @@ use super::incident::Incident;
 use super::remains::Remains;
 use crate::config::ClockKind;
 use crate::hosts::{HostStatistics, NetworkStatistics};
+use crate::late::LateReport;
 use crate::record::RecordingReport;
 use crate::runtime::{RoleId, ports};
 use crate::scenario::Scenario;
@@ -34,6 +35,8 @@ pub struct Outcome {
     pub grants: Vec<Grant>,
     /// The recording, if there is one.
     pub recording: Option<RecordingReport>,
+    /// The late ticks with their causes, in real time.
+    pub late: Option<LateReport>,
     /// The domain that was used, if there was one.
     pub domain: Option<PathBuf>,
     /// The signal that ended the run early, or 0.

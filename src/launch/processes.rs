@@ -16,6 +16,7 @@ use super::relay::RelayWatch;
 use super::remains::Remains;
 use super::standstill::attach_remedy;
 use super::supervision::Member;
+use super::tracer::TracerWatch;
 use super::{Launch, LaunchError, Outcome, Progress};
 use crate::bus::domain::{Domain, OwnedDomain, require_files};
 use crate::bus::iox::IoxBus;
@@ -23,6 +24,7 @@ use crate::bus::{Bus, BusError, Signal, Write};
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::ClockKind;
 use crate::hosts::{NetworkStatistics, RELAY};
+use crate::late::TRACER;
 use crate::record::RECORDER;
 use crate::runtime::{
     Backoff, RoleId, depths, hold_low_latency_idle, report, request_short_slices, shared_memory_bytes, topic,
@@ -104,10 +106,24 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     }
     let score = scorer.finish()?;
     let (incidents, recorder) = (supervisor.incidents.finish(&score.recoveries_s), supervisor.recorder);
+    let late = supervisor.tracer.finish(scenario, domain, &reports);
     let recording = recorder.finish(domain, &reports, NetworkStatistics::merge(&hosts).as_ref());
     let domain = Some(domain.root().to_owned());
     let remains = Some(Remains::new(bus, owned, janitor));
-    Ok(Outcome { reports, unbooked, problems, score, incidents, hosts, grants, recording, domain, signal, remains })
+    Ok(Outcome {
+        reports,
+        unbooked,
+        problems,
+        score,
+        incidents,
+        hosts,
+        grants,
+        recording,
+        late,
+        domain,
+        signal,
+        remains,
+    })
 }
 
 /// Creates a domain with the shared memory that a run of a scenario needs.
@@ -212,6 +228,7 @@ pub(super) struct Supervisor<'a> {
     recorder: RecorderWatch,
     foxglove: Companion,
     relay: RelayWatch,
+    tracer: TracerWatch,
 }
 
 impl<'a> Supervisor<'a> {
@@ -225,6 +242,7 @@ impl<'a> Supervisor<'a> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
         let mut recorder = RecorderWatch::start(launch.record.as_deref(), scenario, domain, bus)?;
         let foxglove = foxglove::start(launch.foxglove, domain)?;
+        let tracer = TracerWatch::start(scenario, domain)?;
         let hub = launch.host.as_ref().map_or("", |seat| &seat.host);
         let relay = RelayWatch::start(launch.host.as_ref(), hub, scenario, domain)?;
         // All roles start first: they prepare while their links are opened here.
@@ -248,7 +266,20 @@ impl<'a> Supervisor<'a> {
         members.iter_mut().zip(started).for_each(|(member, (_, process))| member.process = process);
         let externals = ExternalWatch::new(members.len());
         let (word, incidents) = (Schedule::default(), Incidents::default());
-        Ok(Self { scenario, domain, janitor, members, externals, schedule, word, incidents, recorder, foxglove, relay })
+        Ok(Self {
+            scenario,
+            domain,
+            janitor,
+            members,
+            externals,
+            schedule,
+            word,
+            incidents,
+            recorder,
+            foxglove,
+            relay,
+            tracer,
+        })
     }
 
     /// See [`blame`].
@@ -367,7 +398,12 @@ impl<'a> Supervisor<'a> {
             }
             let recorder = self.recorder.has_reached(state)?;
             let foxglove = self.foxglove.ready(&foxglove::address_path(self.domain))?;
-            let watchers = [(RECORDER, recorder), ("foxglove", foxglove), (RELAY, self.relay.ready()?)];
+            let watchers = [
+                (RECORDER, recorder),
+                ("foxglove", foxglove),
+                (RELAY, self.relay.ready()?),
+                (TRACER, self.tracer.ready(self.domain)?),
+            ];
             if let Some(incident) = self.relay.supervise(self.scenario, 0).into_iter().next() {
                 return Err(LaunchError::Died {
                     role: incident.role,
@@ -467,6 +503,7 @@ impl<'a> Supervisor<'a> {
         let ticks_ns = (self.scenario.last_tick + 1).saturating_mul(self.scenario.period_ns);
         let over = self.scenario.clock == ClockKind::Realtime && now_ns > self.word.epoch_ns.saturating_add(ticks_ns);
         self.recorder.supervise(self.janitor);
+        self.tracer.supervise(self.janitor);
         self.foxglove.loss(false, self.janitor);
         for member in &mut self.members {
             member.in_ticks(over);
@@ -574,11 +611,12 @@ impl<'a> Supervisor<'a> {
             let _ = self.announce();
             self.pause(monotonic_ns() + LOOK_NS);
         }
+        self.tracer.companion.stop();
         // Readers of samples end after all writers; the recorder once its file is written, which a busy disk may delay; the relay
         // once no other host is missing.
         let begun_ns = monotonic_ns();
         let within = |limit_ns: u64| monotonic_ns() - begun_ns < limit_ns;
-        while self.foxglove.lingers() && within(END_LIMIT.as_nanos() as u64)
+        while (self.foxglove.lingers() || self.tracer.companion.lingers()) && within(END_LIMIT.as_nanos() as u64)
             || (self.recorder.lingers() || self.relay.leads() && self.relay.companion.lingers()) && within(HUNG_NS)
         {
             let _ = self.announce();

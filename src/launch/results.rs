@@ -16,6 +16,7 @@ use std::time::SystemTime;
 /// The names of a run's files.
 pub(crate) use crate::seat::SUMMARY;
 pub(crate) const SCENARIO: &str = "scenario.toml";
+pub(crate) const LATE: &str = "late.json";
 pub(crate) const HASHES: &str = "hashes.txt";
 pub(crate) const RECORDING: &str = "run.mcap";
 pub(crate) const REPORT: &str = "report.html";

@@ -241,6 +241,7 @@ impl Steps {
         let role_report =
             |(role, ledger): &(RoleId, Ledger)| report(&self.scenario, *role, ledger, Vec::new(), Vec::new());
         Ok(Outcome {
+            late: None,
             reports: self.seats.iter().map(role_report).collect(),
             recording: None,
             unbooked: Vec::new(),

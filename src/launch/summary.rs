@@ -6,11 +6,12 @@ use super::Score;
 use super::criteria::{Criterion, Judge, accepted, verdict};
 use super::incident::{Action, Incident};
 use super::outcome::{Accounting, Outcome, StageFigures, State, incident_figures, latencies};
-use super::results::{HASHES, LATENCY, LATENCY_LOG, SCENARIO, SUMMARY};
+use super::results::{HASHES, LATE, LATENCY, LATENCY_LOG, SCENARIO, SUMMARY};
 use crate::analysis::Claim;
 use crate::config::{ClockKind, RunId};
 use crate::files;
 use crate::hosts::NetworkStatistics;
+use crate::late::LateReport;
 use crate::record::RecordingReport;
 use crate::rig::Figure;
 use crate::runtime::RoleId;
@@ -26,6 +27,9 @@ use std::time::SystemTime;
 
 /// Layout version of `summary.json`.
 pub const SCHEMA: &str = "corotate/summary/v1";
+
+/// The number of late ticks in a summary.
+const WORST: usize = 10;
 
 /// A run's summary, as it is written to `summary.json`.
 #[derive(Debug, Serialize, Deserialize)]
@@ -82,6 +86,9 @@ pub struct Summary {
     pub state: State,
     /// One entry per role and stage, in the order of a tick.
     pub latencies: Vec<StageFigures>,
+    /// The late ticks by cause, and the worst ones, in real time; `late.json` has all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub late: Option<LateReport>,
     /// The counters of the serial lines, by the body that a device simulates, since the last start of its bridge.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub lines: BTreeMap<String, LineCounters>,
@@ -194,6 +201,7 @@ impl Summary {
             state: State::new(&outcome.reports, &books),
             books,
             latencies,
+            late: outcome.late.as_ref().map(|late| late.worst(WORST)),
             lines: lines(&outcome.reports),
             hosts: NetworkStatistics::merge(&outcome.hosts),
             recording: outcome.recording.clone(),
@@ -233,17 +241,29 @@ fn privileges_unknown(scenario: &Scenario, outcome: &Outcome) -> Vec<String> {
     names.filter(|name| outcome.unbooked.contains(name) || asked && !tells(name)).collect()
 }
 
-/// Writes a run's files into `directory`, which exists: `scenario.toml`, `summary.json`, `hashes.txt`, `latency/`.
+/// Writes a run's files into `directory`, which exists: `scenario.toml`, `summary.json`, `late.json`, `hashes.txt`,
+/// `latency/`.
 ///
 /// # Errors
 /// The error of the file system, with the file's name.
-pub fn write_run(directory: &Path, scenario: &Scenario, summary: &Summary) -> io::Result<()> {
+pub fn write_run(
+    directory: &Path,
+    scenario: &Scenario,
+    summary: &Summary,
+    late: Option<&LateReport>,
+) -> io::Result<()> {
     let run = summary.run.map(RunId::comment);
     write(&directory.join(SCENARIO), |out| out.write_all(scenario.to_file().as_bytes()))?;
     write(&directory.join(SUMMARY), |out| {
         serde_json::to_writer_pretty(&mut *out, summary)?;
         writeln!(out)
     })?;
+    if let Some(late) = late {
+        write(&directory.join(LATE), |out| {
+            serde_json::to_writer(&mut *out, late)?;
+            writeln!(out)
+        })?;
+    }
     write(&directory.join(HASHES), |out| {
         let run = run.as_ref().map_or(String::new(), |run| format!("{run}: "));
         writeln!(out, "# {run}number of ticks from the first on, hash over all samples published in them")?;

@@ -35,6 +35,7 @@ mod seat;
 mod shipped;
 mod signals;
 mod sweep;
+mod tracer;
 mod watch;
 
 use crate::bench::Row;
@@ -125,6 +126,9 @@ enum Command {
     /// Be the other end of a measured hop
     #[command(hide = true)]
     BenchPeer(bench::PeerArguments),
+    /// Record the kernel's trace beside a run
+    #[command(hide = true)]
+    Tracer(tracer::Arguments),
     /// Remove what killed processes of a run leave behind
     #[command(hide = true)]
     Janitor(JanitorArguments),
@@ -279,6 +283,7 @@ fn execute(command: Option<Command>) -> Exit {
         Some(Command::Completions(arguments)) => help::completions(&arguments, Arguments::command()),
         Some(Command::Man(arguments)) => help::man(&arguments, Arguments::command()),
         Some(Command::BenchPeer(arguments)) => Ok(bench::peer(&arguments)),
+        Some(Command::Tracer(arguments)) => tracer::tracer(&arguments),
         Some(Command::Janitor(arguments)) => Ok(janitor(&arguments)),
     };
     result.unwrap_or_else(|exit| exit)

@@ -2,7 +2,8 @@
 
 use super::output::{CommandResult, Exit, Failure, fail, remark, say};
 use super::runs::{self, join};
-use crate::record::{RecordError, RecorderOptions, Recording, RecordingReport, run_recorder};
+use crate::record::{RECORDER, RecordError, RecorderOptions, Recording, RecordingReport, run_recorder};
+use crate::system::name_thread;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
@@ -46,6 +47,7 @@ pub fn record(arguments: &Arguments) -> CommandResult {
         let reason = format!("{file} exists; name another file with --out, or add --overwrite");
         return Err(fail(Exit::Usage, Failure::new("file-exists", reason)));
     }
+    name_thread(RECORDER);
     let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
     let options = RecorderOptions { domain, file: arguments.out.clone() };
     let report = run_recorder(&options, &terminated).map_err(|error| fail(exit_of(&error), error))?;

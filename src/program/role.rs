@@ -2,8 +2,12 @@
 
 use super::output::{CommandResult, Exit, fail};
 use super::runs::join;
+use crate::runtime::watch_continued;
 use crate::seat::{RoleAddress, RoleError, run_role};
+use signal_hook::consts::SIGCONT;
 use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 /// Options of every role.
 #[derive(clap::Args)]
@@ -36,6 +40,11 @@ pub struct PlantArguments {
 /// Runs a role to the end of the run.
 pub fn role(name: &str, arguments: &Arguments) -> CommandResult {
     let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
+    let continued = Arc::new(AtomicBool::new(false));
+    // Without the flag, a stop by a signal is not named as the cause of a late tick.
+    if signal_hook::flag::register(SIGCONT, continued.clone()).is_ok() {
+        watch_continued(continued);
+    }
     let address = RoleAddress { domain, role: name.to_owned() };
     run_role(&address, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
         RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::Hosted { .. } => {

@@ -319,7 +319,7 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
     screen.clear();
     let outcome = outcome.map_err(|error| RunFailure::new(exit_of(&error), error))?;
     let summary = Summary::new(scenario, &outcome, started);
-    let written = write_run(&directory, scenario, &summary);
+    let written = write_run(&directory, scenario, &summary, outcome.late.as_ref());
     let reported = report(arguments, &summary, &directory);
     written.map_err(|error| unwritten(&format_args!("cannot write the results: {error}")))?;
     if let Err(error) = make_latest(&directory) {

@@ -333,7 +333,7 @@ fn record(campaign: &Campaign, case: &Case, path: &Path, signal: &AtomicUsize) -
     let (started, mut silent) = (SystemTime::now(), |_: &Progress<'_>| {});
     let mut launch = Launch { record: Some(path.join("run.mcap")), ..Launch::new(signal, &mut silent) };
     let outcome = crate::launch::run(&scenario, &mut launch)?;
-    write_run(path, &scenario, &Summary::new(&scenario, &outcome, started))
+    write_run(path, &scenario, &Summary::new(&scenario, &outcome, started), outcome.late.as_ref())
         .map_err(|error| Failure::new("cannot-write", format!("{}: {error}", path.display())))
 }
 

@@ -167,6 +167,7 @@ impl<'a, R: Rig> Run<'a, R> {
             grants: Vec::new(),
             line: None,
             outages: Vec::new(),
+            late_ticks: Vec::new(),
         }
     }
 

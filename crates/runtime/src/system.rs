@@ -3,7 +3,8 @@
 
 use rustix::io::retry_on_intr;
 use rustix::rand::{GetRandomFlags, getrandom};
-use std::ffi::OsString;
+use rustix::thread::set_name;
+use std::ffi::{CString, OsString};
 use std::fmt::Display;
 use std::io::{self, Write};
 use std::path::PathBuf;
@@ -33,6 +34,14 @@ pub fn this_program() -> io::Result<Command> {
     let mut command = Command::new(file);
     command.args(arguments);
     Ok(command)
+}
+
+/// Names the calling thread, for tools such as `ps` and for kernel traces: the first 15 bytes of a name.
+pub fn name_thread(name: &str) {
+    let end = name.floor_char_boundary(15);
+    if let Ok(name) = CString::new(&name[..end]) {
+        let _ = set_name(&name);
+    }
 }
 
 /// Formats a time as UTC (RFC 3339); times before 1970 become 1970.

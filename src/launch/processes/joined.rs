@@ -29,7 +29,20 @@ impl<'a> Supervisor<'a> {
         let members = started.into_iter().map(open).collect::<Result<Vec<_>, LaunchError>>()?;
         let externals = ExternalWatch::new(members.len());
         let (word, incidents) = (Schedule::default(), Incidents::default());
-        Ok(Self { scenario, domain, janitor, members, externals, schedule, word, incidents, recorder, foxglove, relay })
+        Ok(Self {
+            scenario,
+            domain,
+            janitor,
+            members,
+            externals,
+            schedule,
+            word,
+            incidents,
+            recorder,
+            foxglove,
+            relay,
+            tracer: TracerWatch::none()?,
+        })
     }
 
     /// Takes over the word of another host's launcher; whether it says anything new.

@@ -72,18 +72,56 @@ pub fn sleep_until(due_ns: u64) {
     let _ = clock_nanosleep_absolute(ClockId::Monotonic, &due);
 }
 
+/// The longest time between two looks at the clock of a thread that spins: it is short unless something takes the thread's core.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct SpinGap {
+    last_ns: u64,
+    longest_ns: u64,
+    end_ns: u64,
+}
+
+impl SpinGap {
+    /// Enters a look at the clock.
+    #[inline]
+    pub fn look(&mut self, now_ns: u64) {
+        let gap_ns = now_ns - self.last_ns.min(now_ns);
+        if gap_ns > self.longest_ns && self.last_ns > 0 {
+            (self.longest_ns, self.end_ns) = (gap_ns, now_ns);
+        }
+        self.last_ns = now_ns;
+    }
+
+    /// Makes the next look the first one after a sleep.
+    #[inline]
+    pub fn pause(&mut self) {
+        self.last_ns = 0;
+    }
+
+    /// Returns the longest time, ns.
+    pub fn longest_ns(&self) -> u64 {
+        self.longest_ns
+    }
+
+    /// Returns the end of the longest time, ns.
+    pub fn end_ns(&self) -> u64 {
+        self.end_ns
+    }
+}
+
 /// Sleeps until `lead_ns` before `due_ns`, then spins until `due_ns`. Returns the time at the end.
 ///
 /// The spin lasts at most `lead_ns`.
 #[inline]
-pub fn wait_until(due_ns: u64, lead_ns: u64) -> u64 {
+pub fn wait_until(due_ns: u64, lead_ns: u64, gap: &mut SpinGap) -> u64 {
     loop {
         let now = monotonic_ns();
+        gap.look(now);
         if now >= due_ns {
             return now;
         }
         if now + lead_ns < due_ns {
             sleep_until(due_ns - lead_ns);
+            gap.pause();
         } else {
             std::hint::spin_loop();
         }
@@ -98,8 +136,20 @@ mod tests {
     fn never_returns_before_the_deadline() {
         for lead_ns in [0, 100_000, 10_000_000] {
             let due = monotonic_ns() + 2_000_000;
-            assert!(wait_until(due, lead_ns) >= due);
+            assert!(wait_until(due, lead_ns, &mut SpinGap::default()) >= due);
         }
-        assert!(wait_until(0, 1_000) > 0, "a past deadline returns at once");
+        assert!(wait_until(0, 1_000, &mut SpinGap::default()) > 0, "a past deadline returns at once");
+    }
+
+    #[test]
+    fn only_the_time_between_looks_of_a_spinning_thread_is_a_gap() {
+        let mut gap = SpinGap::default();
+        for now_ns in [1000, 1010, 1050, 1060] {
+            gap.look(now_ns);
+        }
+        gap.pause();
+        gap.look(9000);
+        gap.look(8990);
+        assert_eq!((gap.longest_ns(), gap.end_ns()), (40, 1050));
     }
 }

@@ -120,6 +120,23 @@ pub struct Realtime {
     /// the period, at least 50 µs.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub late_us: Option<f64>,
+    /// The source of the causes of late ticks.
+    pub trace: Trace,
+}
+
+/// The source of the causes of late ticks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Trace {
+    /// As `kernel` where tracefs can be written, otherwise as `counters`.
+    Auto,
+    /// No causes are looked for.
+    Off,
+    /// Counters of the roles' threads, which need no privilege: they tell the kind of a cause.
+    Counters,
+    /// The kernel's trace (tracefs): it tells the name of the task or interrupt. Where it cannot be written, the run goes on with the
+    /// counters.
+    Kernel,
 }
 
 impl Realtime {
@@ -141,6 +158,7 @@ impl Default for Realtime {
             spin_us: 200.0,
             cutoff: 0.75,
             late_us: None,
+            trace: Trace::Auto,
         }
     }
 }

@@ -4,7 +4,7 @@ use super::accept::Accept;
 use super::body::{BodyInfo, role_names};
 use super::fault::ScriptedFault;
 use super::hosts::Hosts;
-use super::raw::{ClockKind, Realtime, Supervision};
+use super::raw::{ClockKind, Realtime, Supervision, Trace};
 use super::run_id::RunId;
 use crate::bus::Port;
 use crate::control::WatchBounds;
@@ -100,6 +100,11 @@ impl Settings {
     pub fn host_silence_s(&self, running: bool) -> f64 {
         let limit_s = self.hosts.network.silence_timeout_s;
         if running { limit_s } else { limit_s.max(self.startup_timeout_s) }
+    }
+
+    /// Returns true if roles keep records of their late ticks.
+    pub fn keeps_late_ticks(&self) -> bool {
+        self.clock == ClockKind::Realtime && self.realtime.trace != Trace::Off
     }
 
     /// Returns the period h, s.

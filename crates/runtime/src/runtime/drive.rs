@@ -5,10 +5,11 @@
 
 use super::error::NodeError;
 use super::hooks::{self, Failpoint};
+use super::late_watch::LateWatch;
 use super::node::{Node, Poll, ReadyNode, RunCondition};
 use super::role_id::RoleId;
 use crate::bus::{Bus, BusError, Read, Write};
-use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
+use crate::clock::{Grid, SpinGap, monotonic_ns, sleep_until, wait_until};
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -146,12 +147,23 @@ pub struct Driver<'a, 'b, B: Bus> {
     last_tick: u64,
     window_ticks: u64,
     next_turn_ns: u64,
+    late: Option<LateWatch>,
+    /// The longest gap of the current tick's spin.
+    gap: SpinGap,
+    /// True if the process slept until a time before the current tick.
+    slept: bool,
 }
 
 impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
     /// Creates a driver up to `last_tick`; in lockstep at most `window_ticks` ahead of the slowest consumer.
     pub fn new(launcher: &'a mut LauncherLink<'b, B>, last_tick: u64, window_ticks: u64) -> Self {
-        Self { launcher, last_tick, window_ticks, next_turn_ns: 0 }
+        Self { launcher, last_tick, window_ticks, next_turn_ns: 0, late: None, gap: SpinGap::default(), slept: false }
+    }
+
+    /// Adds the records of late ticks.
+    #[must_use]
+    pub fn with_late(self, late: Option<LateWatch>) -> Self {
+        Self { late, ..self }
     }
 
     /// Drives a node on the time grid.
@@ -161,11 +173,13 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
     pub fn realtime(&mut self, node: &mut dyn Node, grid: Grid, policy: &WaitPolicy<'_>) -> Result<Ended, NodeError> {
         while node.next_tick() <= self.last_tick {
             let due_ns = grid.due_ns(node.next_tick());
+            self.slept = false;
             let timed = node.time_triggered() || policy.spin_ns > 0;
             if timed && self.idle_until(due_ns.saturating_sub(policy.lead_ns), node)? {
                 return Ok(Ended::Stopped);
             }
             node.before_tick();
+            self.gap = SpinGap::default();
             let begun = if node.time_triggered() { self.on_time(node, grid, policy.lead_ns)? } else { Poll::Waiting };
             let waits = begun == Poll::Waiting && node.next_tick() <= self.last_tick;
             let executed = if waits { self.on_arrival(node, grid, policy)? } else { Some(begun) };
@@ -180,6 +194,9 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
                 Some(Poll::Waiting | Poll::Missed) => {}
                 None => return Ok(Ended::Stopped),
             }
+            if let Some(late) = &mut self.late {
+                late.look(node, grid, &self.gap, self.slept);
+            }
             if self.turn(node)? {
                 return Ok(Ended::Stopped);
             }
@@ -189,7 +206,7 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
 
     /// Executes a plant's tick when it is due, or the latest due one if this process was delayed.
     fn on_time(&mut self, node: &mut dyn Node, grid: Grid, lead_ns: u64) -> Result<Poll, NodeError> {
-        let now_ns = wait_until(grid.due_ns(node.next_tick()), lead_ns);
+        let now_ns = wait_until(grid.due_ns(node.next_tick()), lead_ns, &mut self.gap);
         node.poll(RunCondition::Now { tick: grid.tick_at(now_ns), now_ns })
     }
 
@@ -207,6 +224,7 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
         let spin_end_ns = monotonic_ns().max(grid.due_ns(tick)) + policy.spin_ns;
         loop {
             let now_ns = monotonic_ns();
+            self.gap.look(now_ns);
             let condition = if now_ns >= overdue_ns { RunCondition::Overdue } else { RunCondition::Arrived };
             match node.poll(condition)? {
                 Poll::Waiting => {}
@@ -214,7 +232,7 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
             }
             hooks::at(Failpoint::Waiting);
             if policy.spin_ns > 0 && now_ns < spin_end_ns {
-                spin(node, policy.yields_to);
+                spin(node, policy.yields_to, &mut self.gap);
             } else if now_ns > end_ns {
                 node.skip_to(self.last_tick + 1);
                 return Ok(Some(Poll::Waiting));
@@ -222,6 +240,7 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
                 if !node.sleep(overdue_ns.min(now_ns + SLEEP_NS).max(now_ns + NAP_NS))? {
                     sleep_until(now_ns + NAP_NS);
                 }
+                self.gap.pause();
                 if self.turn(node)? {
                     return Ok(None);
                 }
@@ -233,6 +252,7 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
     fn idle_until(&mut self, until_ns: u64, node: &mut dyn Node) -> Result<bool, NodeError> {
         while monotonic_ns() < until_ns {
             hooks::at(Failpoint::Waiting);
+            self.slept = true;
             sleep_until(until_ns.min(monotonic_ns() + TURN_NS));
             if until_ns > monotonic_ns() && self.turn(node)? {
                 return Ok(true);
@@ -248,6 +268,7 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
         }
         self.launcher.announce(RoleState::Running, node)?;
         node.refresh()?;
+        self.late.iter_mut().for_each(LateWatch::rebase);
         Ok(self.launcher.stopped()?)
     }
 
@@ -310,9 +331,10 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
 }
 
 /// Spins once for a due sample, or yields if its sender needs this core.
-fn spin(node: &dyn Node, yields_to: &[RoleId]) {
+fn spin(node: &dyn Node, yields_to: &[RoleId], gap: &mut SpinGap) {
     if node.awaits().is_some_and(|role| yields_to.contains(&role)) {
         std::thread::yield_now();
+        gap.pause();
     } else {
         std::hint::spin_loop();
     }

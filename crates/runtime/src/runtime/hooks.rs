@@ -2,7 +2,8 @@
 //! tests only.
 //!
 //! `COROTATE_HOOK="observer sent 1500 KILL"`: the observer sends itself SIGKILL after its 1500th sent sample, once per
-//! run. `STOP` is SIGSTOP, `HANG` sleeps forever. Must not affect a role in any other way.
+//! run. `STOP` is SIGSTOP, `HANG` sleeps forever. `BURN` computes for 300 µs at every 1500th time, and `FAULT` takes page
+//! faults for about as long. Must not affect a role in any other way.
 
 /// A place in the life of a role.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -11,6 +12,8 @@ pub enum Failpoint {
     Opening,
     /// Links are open and warm; the role waits for the run phase.
     Ready,
+    /// All inputs are there, and the role computes.
+    Computing,
     /// A sample is staged and not committed.
     Staged,
     /// Directly before the state is committed.
@@ -50,12 +53,27 @@ mod on {
     use rustix::process::{Signal, getpid, kill_process};
     use std::sync::OnceLock;
     use std::sync::atomic::{AtomicU64, Ordering};
+    use std::time::{Duration, Instant};
+
+    /// The time for which `BURN` computes.
+    const BURN: Duration = Duration::from_micros(300);
+    /// The pages that `FAULT` touches after they were dropped, bytes.
+    const DROPPED: usize = 1 << 20;
+
+    #[derive(Clone, Copy)]
+    enum Action {
+        Signal(Signal),
+        Hang,
+        Burn,
+        Fault,
+    }
 
     struct Hook {
         place: Failpoint,
         left: AtomicU64,
-        /// The signal to send; `None` hangs.
-        signal: Option<Signal>,
+        /// The number of passes from one action to the next, for actions that repeat.
+        every: u64,
+        action: Action,
     }
 
     static HOOK: OnceLock<Option<Hook>> = OnceLock::new();
@@ -73,6 +91,7 @@ mod on {
         let place = match words.next()? {
             "opening" => Failpoint::Opening,
             "ready" => Failpoint::Ready,
+            "computing" => Failpoint::Computing,
             "staged" => Failpoint::Staged,
             "committing" => Failpoint::Committing,
             "in-commit" => Failpoint::InCommit,
@@ -81,14 +100,16 @@ mod on {
             "waiting" => Failpoint::Waiting,
             _ => return None,
         };
-        let left = AtomicU64::new(words.next()?.parse().ok()?);
-        let signal = match words.next()? {
-            "KILL" => Some(Signal::KILL),
-            "STOP" => Some(Signal::STOP),
-            "HANG" => None,
+        let every = words.next()?.parse().ok()?;
+        let action = match words.next()? {
+            "KILL" => Action::Signal(Signal::KILL),
+            "STOP" => Action::Signal(Signal::STOP),
+            "HANG" => Action::Hang,
+            "BURN" => Action::Burn,
+            "FAULT" => Action::Fault,
             _ => return None,
         };
-        Some(Hook { place, left, signal })
+        Some(Hook { place, left: AtomicU64::new(every), every, action })
     }
 
     /// Triggers the hook if it is armed for this place.
@@ -98,11 +119,24 @@ mod on {
             && hook.place == place
             && hook.left.fetch_sub(1, Ordering::Relaxed) == 1
         {
-            match hook.signal {
-                Some(signal) => _ = kill_process(getpid(), signal),
-                None => loop {
+            match hook.action {
+                Action::Signal(signal) => _ = kill_process(getpid(), signal),
+                Action::Hang => loop {
                     std::thread::park();
                 },
+                Action::Burn => {
+                    hook.left.store(hook.every, Ordering::Relaxed);
+                    let begun = Instant::now();
+                    while begun.elapsed() < BURN {
+                        std::hint::spin_loop();
+                    }
+                }
+                Action::Fault => {
+                    hook.left.store(hook.every, Ordering::Relaxed);
+                    if let Ok(mut pages) = memmap2::MmapMut::map_anon(DROPPED) {
+                        pages.iter_mut().step_by(4096).for_each(|byte| *byte = std::hint::black_box(1));
+                    }
+                }
             }
         }
     }

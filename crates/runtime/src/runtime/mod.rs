@@ -10,6 +10,7 @@ mod disturb;
 pub(crate) mod drive;
 mod error;
 pub(crate) mod hooks;
+mod late_watch;
 mod line;
 mod link;
 mod node;
@@ -18,12 +19,14 @@ mod role_function;
 mod role_id;
 mod role_impl;
 mod sample_source;
+mod usage;
 
 pub use budget::{CpuQuota, cpu_quota, empty_budgets, grant_budgets};
 pub use device::{DeviceConfig, DeviceLink};
 pub use disturb::{Disturbance, Interruptions, LateSamples};
 pub use drive::{Backoff, Driver, Ended, LauncherLink, drive_in_turn, drive_in_turn_tracked, run_in_turn};
 pub use error::{DeviceError, NodeError};
+pub use late_watch::LateWatch;
 pub use line::{Line, LineError};
 #[cfg(feature = "hosts")]
 pub use link::RetainedSamples;
@@ -33,7 +36,7 @@ pub use node::retained_samples;
 pub use node::{
     Node, Poll, Ports, ReadyNode, RunCondition, build_rig, ports, private_ledger, report, shared_ledger, topic,
 };
-pub use node::{accepted_ticks, ledger_file, ledger_words, next_tick, shared_memory_bytes};
+pub use node::{accepted_ticks, late_log, ledger_file, ledger_words, next_tick, shared_memory_bytes};
 #[cfg(feature = "hosts")]
 pub use privileges::take_priority_above_roles;
 pub use privileges::{Privileges, hold_low_latency_idle, priority_remedy, refused_priority, unavailable_cores};
@@ -44,6 +47,7 @@ pub use privileges::{
 pub use role_function::{RoleFunction, TickSamples};
 pub use role_id::RoleId;
 pub use role_impl::RoleImpl;
+pub use usage::watch_continued;
 
 use crate::bus::Depths;
 use crate::config::{ClockKind, Settings};

@@ -17,7 +17,7 @@ pub(super) mod ports;
 pub use context::NodeContext;
 #[cfg(feature = "hosts")]
 pub use context::retained_samples;
-pub use context::{accepted_ticks, ledger_file, ledger_words, next_tick};
+pub use context::{accepted_ticks, late_log, ledger_file, ledger_words, next_tick};
 pub use contract::{Node, Poll, ReadyNode, RunCondition};
 pub use ports::{Ports, ports, topic};
 
@@ -124,6 +124,7 @@ pub fn report(
         grants,
         line: None,
         outages: Vec::new(),
+        late_ticks: late_log(scenario, role, ledger).map_or_else(Vec::new, |log| log.records(0).collect()),
     }
 }
 

@@ -54,6 +54,25 @@ impl RoleId {
         hosted
     }
 
+    /// Returns a number for records of fixed size: 1 for the observer, 2 for the controller, then the plants. 0 is no role.
+    pub fn number(self) -> u64 {
+        match self {
+            Self::Observer => 1,
+            Self::Controller => 2,
+            Self::Plant(index) => 3 + index as u64,
+        }
+    }
+
+    /// Returns the role with this [number](Self::number).
+    pub fn from_number(number: u64) -> Option<Self> {
+        match number {
+            0 => None,
+            1 => Some(Self::Observer),
+            2 => Some(Self::Controller),
+            plant => Some(Self::Plant(plant as usize - 3)),
+        }
+    }
+
     /// Returns the kind of role as on the command line.
     pub fn kind(self) -> &'static str {
         match self {

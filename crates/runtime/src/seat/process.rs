@@ -12,12 +12,12 @@ use crate::panics;
 use crate::runtime::drive::{Driver, Ended, Heartbeat, LauncherLink, WaitPolicy};
 use crate::runtime::hooks::{self, Failpoint};
 use crate::runtime::{
-    DeviceError, NodeError, Privileges, ReadyNode, RoleFunction, RoleId, RoleImpl, depths, ledger_file, ledger_words,
-    ports, release_priority, report, request_short_slices, take_privileges, topic, window_ticks,
+    DeviceError, LateWatch, NodeError, Privileges, ReadyNode, RoleFunction, RoleId, RoleImpl, depths, ledger_file,
+    ledger_words, ports, release_priority, report, request_short_slices, take_privileges, topic, window_ticks,
 };
 use crate::sample::{Phase, RoleState, Schedule};
 use crate::scenario::{self, Scenario};
-use crate::system::remedy;
+use crate::system::{name_thread, remedy};
 use crate::telemetry::{Latency, Ledger, LedgerError, RoleReport, StageReport};
 use std::io;
 use std::os::unix::ffi::OsStrExt;
@@ -227,6 +227,7 @@ pub fn run_role(address: &RoleAddress, terminated: &AtomicBool) -> Result<(), Ro
     let (domain, scenario) = join(&address.domain)?;
     let role = find_role(&scenario, &address.role)?;
     require_process(&scenario, role)?;
+    name_thread(&address.role);
     panics::keep_in(panic_path(domain.root(), &address.role));
     let companions = role.process_members(&scenario).into_iter().filter(|member| *member != role);
     let companions = companions.map(|member| Ok((member, take_ledger(&domain, &scenario, member)?)));
@@ -406,7 +407,11 @@ pub fn serve<B: Bus + 'static>(
     let mut stages = Vec::new();
     let leads = ledgers.iter().any(|(role, _)| *role == RoleId::Plant(0));
     let ended = match begin(scenario, leads, &mut node, &mut launcher, &mut stages)? {
-        Some(schedule) => drive(scenario, role, &mut node, &mut launcher, &schedule, &privileges)?,
+        Some(schedule) => {
+            let grid = Grid { epoch_ns: schedule.epoch_ns, period_ns: scenario.period_ns };
+            let (policy, late) = (wait_policy(scenario, role, &privileges), LateWatch::open(scenario, &ledgers));
+            drive(scenario, &mut node, &mut launcher, grid, &policy, late)?
+        }
         None => Ended::Stopped,
     };
     node.finish()?;
@@ -541,20 +546,19 @@ fn wait_policy<'a>(scenario: &Settings, role: RoleId, privileges: &'a Privileges
 
 fn drive<B: Bus>(
     scenario: &Settings,
-    role: RoleId,
     node: &mut ReadyNode,
     launcher: &mut LauncherLink<'_, B>,
-    schedule: &Schedule,
-    privileges: &Privileges,
+    grid: Grid,
+    policy: &WaitPolicy<'_>,
+    late: Option<LateWatch>,
 ) -> Result<Ended, RoleError> {
-    let grid = Grid { epoch_ns: schedule.epoch_ns, period_ns: scenario.period_ns };
     // A successor begins with the next tick of the grid in real time, with the first unexecuted tick in lockstep.
-    let late = scenario.clock == ClockKind::Realtime && !launcher.first();
-    let first_tick = if late { grid.next_at(monotonic_ns()) } else { node.next_tick() };
+    let succeeds = scenario.clock == ClockKind::Realtime && !launcher.first();
+    let first_tick = if succeeds { grid.next_at(monotonic_ns()) } else { node.next_tick() };
     node.start(grid, first_tick.min(scenario.last_tick + 1))?;
-    let mut driver = Driver::new(launcher, scenario.last_tick, window_ticks(scenario));
+    let mut driver = Driver::new(launcher, scenario.last_tick, window_ticks(scenario)).with_late(late);
     let ended = match scenario.clock {
-        ClockKind::Realtime => driver.realtime(&mut **node, grid, &wait_policy(scenario, role, privileges)),
+        ClockKind::Realtime => driver.realtime(&mut **node, grid, policy),
         ClockKind::Lockstep | ClockKind::InProcess => driver.lockstep(&mut **node),
     };
     Ok(ended?)

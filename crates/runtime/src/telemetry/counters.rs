@@ -3,7 +3,7 @@
 //! Nodes and links decide which counter an event belongs to; this module only adds.
 
 use super::ledger::Ledger;
-use super::{LinkRead, LinkWritten, StateHash, Ticks, WatchReport, WatchedReport};
+use super::{LateRecord, LateTicks, LinkRead, LinkWritten, StateHash, Ticks, WatchReport, WatchedReport};
 use crate::control::{Breaches, Watchdog};
 use crate::role::Refusal;
 use crate::state::persist_fields;
@@ -21,6 +21,10 @@ pub struct TickCounters {
     scripted: u64,
     anew: u64,
     first_disturbed: Option<u64>,
+    /// Late ticks of this process.
+    late_ticks: LateTicks,
+    /// True if a scripted fault stalled the role before the current tick.
+    just_stalled: bool,
 }
 
 persist_fields!(TickCounters, next, executed, missed, starved, late, safe, stalled, scripted, anew, first_disturbed);
@@ -40,6 +44,9 @@ impl TickCounters {
             self.disturbed(self.next);
             self.missed += missed;
             self.next = tick;
+            self.late_ticks.missed += missed;
+            self.late_ticks.missed_end = tick;
+            self.late_ticks.last.stalled = self.just_stalled;
         }
         missed
     }
@@ -51,17 +58,31 @@ impl TickCounters {
         self.next += 1;
     }
 
-    /// Counts a tick at which an input was absent.
+    /// Counts a tick at which an input was absent; the sender of that input as
+    /// [`RoleId::number`](crate::runtime::RoleId::number).
     #[inline]
-    pub fn starved(&mut self, tick: u64) {
+    pub fn starved(&mut self, tick: u64, sender: u64) {
         self.starved += 1;
         self.disturbed(tick);
+        self.enter_late(LateRecord { tick, sender, starved: true, ..LateRecord::default() });
     }
 
     /// Counts a tick that was executed late, with all its inputs.
     #[inline]
-    pub fn late(&mut self) {
+    pub fn late(&mut self, record: LateRecord) {
         self.late += 1;
+        self.enter_late(record);
+    }
+
+    fn enter_late(&mut self, record: LateRecord) {
+        self.late_ticks.executed += 1;
+        self.late_ticks.last = LateRecord { stalled: self.just_stalled, ..record };
+    }
+
+    /// Returns the late ticks since this process started.
+    #[inline]
+    pub fn late_ticks(&self) -> &LateTicks {
+        &self.late_ticks
     }
 
     /// Counts a tick at which the safe command was applied.
@@ -70,16 +91,19 @@ impl TickCounters {
         self.safe += 1;
     }
 
-    /// Counts scripted stalls.
+    /// Counts the scripted stalls before a tick.
     #[inline]
     pub fn stalled(&mut self, stalls: u64) {
         self.stalled += stalls;
+        self.just_stalled = stalls > 0;
     }
 
     /// Counts the next tick as missed: an input is missing, or, if `scripted`, a scripted fault takes the tick.
     pub fn pass(&mut self, scripted: bool) {
         self.scripted += u64::from(scripted);
         self.skip_to(self.next + 1);
+        // A tick that a fault takes has no other cause.
+        self.late_ticks.missed -= u64::from(scripted);
     }
 
     /// Counts a restart that lost the predecessor's state. Every tick from here on may differ from an undisturbed run's.

@@ -1,6 +1,6 @@
 //! The final report of a role: counters, hash, histograms, privileges.
 
-use super::{Checkpoints, Latency, Tallies};
+use super::{Checkpoints, LateRecord, Latency, Tallies};
 use crate::serial::LineCounters;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -30,6 +30,9 @@ pub struct RoleReport {
     /// The times in which that device was absent.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub outages: Vec<Outage>,
+    /// The records of its late ticks, in real time; at most as many as a ledger keeps.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub late_ticks: Vec<LateRecord>,
 }
 
 /// A time in which a device did not answer.

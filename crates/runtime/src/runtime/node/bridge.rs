@@ -18,7 +18,7 @@ use crate::runtime::role_id::RoleId;
 use crate::sample::{Message, Sample, Stamp, content_length, copy_fields};
 use crate::serial::{Answer, LineCounters, Samples};
 use crate::state::{Persist, Words};
-use crate::telemetry::{Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
+use crate::telemetry::{LateRecord, LateTicks, Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
 
 /// A device with its links and counters.
 pub struct BridgeNode<R: Rig, B: Bus> {
@@ -153,9 +153,16 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             *sample.stamp_mut() = stamp;
         })?;
         if event.missed() {
-            self.counters.starved(tick);
+            self.counters.starved(tick, RoleId::Controller.number());
         } else if clock == Clock::Monotonic && self.asked_ns.saturating_sub(origin_ns) > self.late_ns {
-            self.counters.late();
+            let (due_ns, asked_ns) = (origin_ns, self.asked_ns);
+            self.counters.late(LateRecord {
+                tick,
+                due_ns,
+                began_ns: asked_ns,
+                done_ns: asked_ns,
+                ..LateRecord::default()
+            });
         }
         if self.link.counters().restarts > 0 {
             self.counters.disturbed(tick);
@@ -332,6 +339,11 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
 
     fn ticks(&self) -> Ticks {
         self.counters.report()
+    }
+
+    #[inline]
+    fn late_ticks(&self) -> Option<&LateTicks> {
+        Some(self.counters.late_ticks())
     }
 
     fn stages(&self) -> Vec<StageReport> {

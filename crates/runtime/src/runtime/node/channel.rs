@@ -8,10 +8,11 @@ use crate::rig::{BodyInfo, Estimate, Fleet, Rig};
 use crate::role::{Controller, Guard, Law};
 use crate::runtime::error::NodeError;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
+use crate::runtime::role_id::RoleId;
 use crate::runtime::sample_source::SampleSource;
 use crate::sample::Message;
 use crate::state::{Persist, Words};
-use crate::telemetry::Latency;
+use crate::telemetry::{LateRecord, Latency};
 
 /// The channel of a single driven body.
 pub type Single<R, B> = Channel<<R as Rig>::Law, <R as Rig>::MeasurementGuard, B>;
@@ -212,7 +213,10 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
             stages.enter_missed(missed, self.began_ns);
             stages.step.record(self.began_ns, self.sent_ns);
             stages.age.record(stages.origin_ns, self.sent_ns);
-            stages.late |= self.sent_ns.saturating_sub(stages.origin_ns) > stages.late_ns;
+            if self.sent_ns.saturating_sub(stages.origin_ns) > stages.late_ns {
+                let measured_ns = self.measurement.sample().map_or(0, |measurement| measurement.stamp().sent_ns);
+                stages.enter_late(self.body, measured_ns, self.sent_ns);
+            }
         }
         self.finish_command()
     }
@@ -238,8 +242,9 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
 pub struct Stages {
     /// The age beyond which a tick is late, ns.
     pub late_ns: u64,
-    /// True if a command of this tick was late, and if one was not computed.
-    pub late: bool,
+    /// The late command of this tick, if one was late.
+    pub late: Option<LateRecord>,
+    /// True if a command of this tick was not computed.
     pub starved: bool,
     pub tick: u64,
     /// Origin and sending of the current estimate, and arrival of the last input, ns.
@@ -253,6 +258,19 @@ pub struct Stages {
 }
 
 impl Stages {
+    /// Records a late command, sent at `sent_ns`, and the measurement for it; of several commands the last one.
+    #[cold]
+    fn enter_late(&mut self, body: usize, measured_ns: u64, sent_ns: u64) {
+        let estimate = (RoleId::Observer.number(), self.estimate_sent_ns);
+        let mut last = self.late.map_or(estimate, |late| (late.sender, late.input_ns));
+        if measured_ns > last.1 {
+            last = (RoleId::Plant(body).number(), measured_ns);
+        }
+        let ((sender, input_ns), tick, due_ns, began_ns) = (last, self.tick, self.origin_ns, self.received_ns);
+        let late = LateRecord { tick, sender, due_ns, input_ns, began_ns, done_ns: sent_ns, ..LateRecord::default() };
+        self.late = Some(late);
+    }
+
     /// Records missed commands from their due instants.
     #[inline]
     pub fn enter_missed(&mut self, due_ns: impl Iterator<Item = u64>, until_ns: u64) {

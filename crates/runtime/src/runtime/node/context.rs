@@ -10,7 +10,7 @@ use crate::runtime::link::{AcceptedTicks, Extent, Input, Output, RetainedSamples
 use crate::runtime::role_id::RoleId;
 use crate::runtime::window_ticks;
 use crate::state::{Persist, StoredWords};
-use crate::telemetry::{Ledger, TickCounters};
+use crate::telemetry::{LateLog, Ledger, TickCounters};
 
 /// Pause between two polls of a device's line, ns.
 pub(super) const LOOK_NS: u64 = 50_000;
@@ -123,7 +123,15 @@ pub fn accepted_ticks(scenario: &Settings, grid: Option<Grid>) -> AcceptedTicks 
 
 /// Returns the number of words in a role's ledger besides its record.
 pub fn ledger_words(scenario: &Settings, role: RoleId) -> usize {
-    words_of(&ports(scenario, role).writes, extent(scenario))
+    let late = if scenario.keeps_late_ticks() { LateLog::words() } else { 0 };
+    words_of(&ports(scenario, role).writes, extent(scenario)) + late
+}
+
+/// Returns the records of a role's late ticks, if the scenario asks for them.
+pub fn late_log(scenario: &Settings, role: RoleId, ledger: &Ledger) -> Option<LateLog> {
+    let ledger = ledger.reopened();
+    ledger.take(words_of(&ports(scenario, role).writes, extent(scenario)));
+    scenario.keeps_late_ticks().then(|| LateLog::open(&ledger))
 }
 
 pub(super) fn words_of(written: &[Port], extent: Extent) -> usize {

@@ -4,7 +4,7 @@ use crate::clock::Grid;
 use crate::runtime::error::NodeError;
 use crate::runtime::role_id::RoleId;
 use crate::serial::LineCounters;
-use crate::telemetry::{LedgerError, Outage, StageReport, Ticks};
+use crate::telemetry::{LateTicks, LedgerError, Outage, StageReport, Ticks};
 
 /// Condition under which a node executes its next tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -94,6 +94,8 @@ pub trait Node {
     fn refresh(&mut self) -> Result<(), NodeError>;
     /// Returns the tick counters.
     fn ticks(&self) -> Ticks;
+    /// Returns the late ticks since this process started.
+    fn late_ticks(&self) -> Option<&LateTicks>;
     /// Returns the latencies.
     fn stages(&self) -> Vec<StageReport>;
     /// Returns the length of the node's state, words.

@@ -11,13 +11,14 @@ use crate::control::Watchdog;
 use crate::rig::{BodyInfo, Command, Estimate, Fleet, FleetCommand, Rig, Watched};
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::error::NodeError;
+use crate::runtime::hooks::{self, Failpoint};
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::runtime::role_id::RoleId;
 use crate::runtime::sample_source::{Progress, SampleSource};
 use crate::sample::Message;
 use crate::serial::LineCounters;
 use crate::state::{Persist, Words};
-use crate::telemetry::{Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
+use crate::telemetry::{LateTicks, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
 
 /// A controller with its links and counters.
 pub struct ControllerNode<R: Rig, B: Bus> {
@@ -227,6 +228,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
                 self.counters.disturbed(stamp.tick);
             }
         }
+        hooks::at(Failpoint::Computing);
         if self.watchdog.active() {
             self.watch();
         }
@@ -246,10 +248,11 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             }
         }
         (self.stages.origin_ns, self.stages.estimate_sent_ns) = (stamp.origin_ns, stamp.sent_ns);
-        (self.stages.tick, self.stages.starved, self.stages.late) = (stamp.tick, starved, false);
+        (self.stages.tick, self.stages.starved, self.stages.late) = (stamp.tick, starved, None);
         self.skip_to(stamp.tick);
         if starved {
-            self.counters.starved(stamp.tick);
+            let absent = self.channels.iter().find_map(|channel| channel.late(stamp.tick));
+            self.counters.starved(stamp.tick, absent.map_or(0, |body| RoleId::Plant(body).number()));
         }
         self.counters.executed();
         commit(self);
@@ -336,8 +339,8 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
             hop.record(*estimate_sent_ns, *received_ns);
         }
         self.channels.iter_mut().try_for_each(|channel| channel.finish_tick(stages.as_deref_mut()))?;
-        if self.stages.late && !self.stages.starved {
-            self.counters.late();
+        if let Some(late) = self.stages.late.take().filter(|_| !self.stages.starved) {
+            self.counters.late(late);
         }
         Ok(())
     }
@@ -372,6 +375,11 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     fn ticks(&self) -> Ticks {
         self.counters.report()
+    }
+
+    #[inline]
+    fn late_ticks(&self) -> Option<&LateTicks> {
+        Some(self.counters.late_ticks())
     }
 
     fn stages(&self) -> Vec<StageReport> {

@@ -8,7 +8,7 @@ use super::contract::{Node, Poll, ReadyNode, RunCondition};
 use crate::clock::{Grid, monotonic_ns};
 use crate::runtime::error::NodeError;
 use crate::runtime::role_id::RoleId;
-use crate::telemetry::{LedgerError, StageReport, Ticks};
+use crate::telemetry::{LateTicks, LedgerError, StageReport, Ticks};
 
 /// Longest sleep of a group that lacks several outside inputs, ns.
 const NAP_NS: u64 = 50_000;
@@ -213,6 +213,11 @@ impl Node for GroupNode {
 
     fn ticks(&self) -> Ticks {
         self.members.last().map_or_else(Ticks::default, |member| member.node.ticks())
+    }
+
+    /// Of the last member; a driver asks each one.
+    fn late_ticks(&self) -> Option<&LateTicks> {
+        self.members.last().and_then(|member| member.node.late_ticks())
     }
 
     fn stages(&self) -> Vec<StageReport> {

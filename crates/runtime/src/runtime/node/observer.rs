@@ -10,13 +10,14 @@ use crate::rig::{Estimate, Measurement, Rig};
 use crate::role::Observer;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::error::NodeError;
+use crate::runtime::hooks::{self, Failpoint};
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::runtime::role_id::RoleId;
 use crate::runtime::sample_source::{Progress, SampleSource};
 use crate::sample::Message;
 use crate::serial::LineCounters;
 use crate::state::{Persist, Words};
-use crate::telemetry::{Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
+use crate::telemetry::{LateRecord, LateTicks, Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
 
 /// The instants of one executed tick, ns.
 #[derive(Debug, Clone, Copy, Default)]
@@ -90,6 +91,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
                 self.counters.disturbed(stamp.tick);
             }
         }
+        hooks::at(Failpoint::Computing);
         let (observer, source, clock) = (&mut self.observer, &self.source, self.clock);
         let mut done = 0;
         self.estimate.stage(|sample| {
@@ -219,7 +221,10 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
             self.step.record(received, done);
             self.age.record(origin, done);
             if done.saturating_sub(origin) > self.late_ns {
-                self.counters.late();
+                let sender = RoleId::Plant(0).number();
+                let (due_ns, input_ns, began_ns, done_ns) = (origin, sent, received, done);
+                let instants = LateRecord { due_ns, input_ns, began_ns, done_ns, ..LateRecord::default() };
+                self.counters.late(LateRecord { tick, sender, ..instants });
             }
         }
         Ok(self.estimate.finish()?)
@@ -253,6 +258,11 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
 
     fn ticks(&self) -> Ticks {
         self.counters.report()
+    }
+
+    #[inline]
+    fn late_ticks(&self) -> Option<&LateTicks> {
+        Some(self.counters.late_ticks())
     }
 
     fn stages(&self) -> Vec<StageReport> {

@@ -15,7 +15,7 @@ use crate::runtime::role_function::FunctionRole;
 use crate::runtime::role_id::RoleId;
 use crate::sample::{Message, Stamp};
 use crate::state::{Persist, Words};
-use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
+use crate::telemetry::{LateRecord, LateTicks, Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
 use std::borrow::{Borrow, BorrowMut};
 
 /// A body or fleet whose samples links carry.
@@ -207,9 +207,10 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             self.enter_age(event, now_ns);
         }
         if event.missed() {
-            self.counters.starved(tick);
+            self.counters.starved(tick, RoleId::Controller.number());
         } else if self.clock == Clock::Monotonic && now_ns.saturating_sub(self.grid.due_ns(tick)) > self.late_ns {
-            self.counters.late();
+            let due_ns = self.grid.due_ns(tick);
+            self.counters.late(LateRecord { tick, due_ns, began_ns: now_ns, done_ns: now_ns, ..LateRecord::default() });
         }
         if matches!(event, CommandEvent::Expired | CommandEvent::Safe) {
             self.counters.safe();
@@ -403,6 +404,11 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P
 
     fn ticks(&self) -> Ticks {
         self.counters.report()
+    }
+
+    #[inline]
+    fn late_ticks(&self) -> Option<&LateTicks> {
+        Some(self.counters.late_ticks())
     }
 
     fn stages(&self) -> Vec<StageReport> {

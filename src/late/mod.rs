@@ -1,0 +1,24 @@
+//! Late ticks and their causes.
+//!
+//! | file | duty |
+//! |---|---|
+//! | `model` | late ticks with causes, as `late.json` has them |
+//! | `delay` | the length and the parts of one delay |
+//! | `counters` | causes from the counters of a role's thread: their kinds |
+//! | `explain` | causes from the kernel's events: their names |
+//! | `tracer` | the process that records the kernel's trace beside a run |
+//! | `assemble` | the report of a run, with chains of roles and totals by cause |
+
+mod assemble;
+mod counters;
+mod delay;
+mod explain;
+mod model;
+mod tracer;
+
+pub use assemble::report;
+pub use corotate_trace::{Cause, CauseKind};
+pub use model::{
+    CauseTotal, LateKind, LateReport, LateTick, Pattern, SCHEMA, Slice, SliceKind, Source, TickOfRole, TracerCost,
+};
+pub use tracer::{Findings, TRACER, findings, ready_path, remove_dead_traces, run_tracer};

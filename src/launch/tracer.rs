@@ -1,0 +1,59 @@
+//! The process that records the kernel's trace beside a run, seen from the launcher.
+//!
+//! The ticks wait for it once, until it records. Its end is not the run's.
+
+use super::LaunchError;
+use super::companion::Companion;
+use super::janitor::Janitor;
+use crate::bus::domain::Domain;
+use crate::config::{ClockKind, Trace};
+use crate::late::{Findings, LateReport, TRACER, findings, ready_path, report};
+use crate::scenario::Scenario;
+use crate::telemetry::RoleReport;
+use corotate_trace::require_tracefs;
+use std::process::Command;
+
+/// The tracing process of a run, if it has one.
+pub(super) struct TracerWatch {
+    pub companion: Companion,
+    /// The reason for which the run is not traced.
+    note: Option<String>,
+}
+
+impl TracerWatch {
+    /// Starts the process if the scenario asks for the kernel's trace and the machine permits it.
+    pub fn start(scenario: &Scenario, domain: &Domain) -> Result<Self, LaunchError> {
+        let asked =
+            scenario.clock == ClockKind::Realtime && matches!(scenario.realtime.trace, Trace::Auto | Trace::Kernel);
+        let note = require_tracefs().err().filter(|_| asked).map(|error| error.to_string());
+        let arguments = (asked && note.is_none()).then_some(|command: &mut Command| {
+            command.arg(TRACER).arg("--domain").arg(domain.root());
+        });
+        Ok(Self { companion: Companion::start(TRACER, arguments)?, note })
+    }
+
+    /// Returns the companion of a run that another host traces, or none does.
+    #[cfg(feature = "hosts")]
+    pub fn none() -> Result<Self, LaunchError> {
+        Ok(Self { companion: Companion::start(TRACER, None::<fn(&mut Command)>)?, note: None })
+    }
+
+    /// Returns true once the process records, or cannot.
+    pub fn ready(&mut self, domain: &Domain) -> Result<bool, LaunchError> {
+        self.companion.ready(&ready_path(domain))
+    }
+
+    /// Checks if it has failed: then the run goes on without it.
+    pub fn supervise(&mut self, janitor: &mut Janitor) {
+        if let Some(cause) = self.companion.loss(false, janitor) {
+            self.note = Some(format!("the tracing process failed: {cause}"));
+        }
+    }
+
+    /// Returns the late ticks of the run with their causes. The process has ended, or is ended now.
+    pub fn finish(self, scenario: &Scenario, domain: &Domain, reports: &[RoleReport]) -> Option<LateReport> {
+        let found: Option<Findings> = findings(domain);
+        drop(self.companion);
+        report(scenario, reports, found, self.note)
+    }
+}

@@ -1,0 +1,234 @@
+//! Late ticks: causes that a test plants at random instants are named, in the kernel's trace by name and in the counters by kind.
+
+use crate::common::{Bench, Running, send_signal, skipped};
+use corotate::clock::raw_ns;
+use corotate::late::{CauseKind, LateReport, LateTick};
+use rustix::thread::{CpuSet, sched_setaffinity};
+use std::ffi::CString;
+use std::path::Path;
+use std::process::Command;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+/// The name of the thread that takes cores away.
+const CULPRIT: &str = "culprit";
+/// The least number of planted late ticks of a run that is judged.
+const PLANTED: usize = 50;
+/// Only one run at a time plants culprits: they would disturb each other.
+static TURN: Mutex<()> = Mutex::new(());
+
+/// Times of disturbances, ns.
+type Times = Vec<(u64, u64)>;
+
+/// Runs a scenario in real time while `disturb` runs beside it, given the run, until the flag is set. Returns the late ticks.
+fn run_beside(
+    bench: &Bench,
+    trace: &str,
+    options: &[&str],
+    disturb: impl Fn(&Bench, &AtomicBool) -> Times + Sync,
+) -> (LateReport, Times) {
+    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    let trace = format!("--set=realtime.trace=\"{trace}\"");
+    let arguments =
+        ["run", "rigid-pair", "--clock=realtime", "--duration=8", "--out=out", "--set=accept={}", "--quiet", &trace];
+    let ended = AtomicBool::new(false);
+    let (done, times) = std::thread::scope(|scope| {
+        let mut command = with_tracefs(bench);
+        let running = Running::new(command.args(arguments).args(options));
+        bench.await_ticks("controller");
+        let culprit = scope.spawn(|| disturb(bench, &ended));
+        let done = running.wait();
+        ended.store(true, Ordering::Relaxed);
+        (done, culprit.join().unwrap())
+    });
+    done.succeeded();
+    (serde_json::from_slice(&std::fs::read(bench.path("out/late.json")).unwrap()).unwrap(), times)
+}
+
+/// Returns a command of the program, in a mount namespace with tracefs if the machine has not mounted it.
+fn with_tracefs(bench: &Bench) -> Command {
+    if has_tracefs() || !rustix::process::geteuid().is_root() {
+        return bench.command();
+    }
+    let mut command = bench.command_of(Path::new("unshare"));
+    let mount = "mount -t tracefs nodev /sys/kernel/tracing 2>/dev/null; exec \"$0\" \"$@\"";
+    command.args(["--mount", "sh", "-c", mount]).arg(bench.command().get_program());
+    command
+}
+
+fn has_tracefs() -> bool {
+    Path::new("/sys/kernel/tracing/instances").exists()
+}
+
+/// Returns true if a run here records the kernel's trace; otherwise reports a skipped check.
+fn has_kernel_trace(report: &LateReport, what: &str) -> bool {
+    let traced = report.source == corotate::late::Source::Kernel;
+    if !traced {
+        skipped(what, report.note.as_deref().unwrap_or("there is no kernel trace"));
+    }
+    traced
+}
+
+/// Pseudo-random pauses of 20 to 60 ms.
+fn pauses() -> impl Iterator<Item = Duration> {
+    let mut state = 7_u64;
+    std::iter::from_fn(move || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        Some(Duration::from_micros(20_000 + (state >> 33) % 40_000))
+    })
+}
+
+/// Makes the calling thread the culprit: its name, its core, and its priority as words of `chrt` or `renice`.
+fn become_culprit(core: usize, priority: &[&str]) {
+    rustix::thread::set_name(&CString::new(CULPRIT).unwrap()).unwrap();
+    let mut set = CpuSet::new();
+    set.set(core);
+    sched_setaffinity(None, &set).unwrap();
+    if let Some((program, words)) = priority.split_first() {
+        let tid = rustix::thread::gettid().as_raw_nonzero().to_string();
+        assert!(Command::new(program).args(words).arg(tid).output().unwrap().status.success(), "{priority:?}");
+    }
+}
+
+/// Calls `disturb` again and again after random pauses, and returns when.
+fn at_random_instants(ended: &AtomicBool, mut disturb: impl FnMut()) -> Times {
+    let mut times = Vec::new();
+    for pause in pauses() {
+        std::thread::sleep(pause);
+        if ended.load(Ordering::Relaxed) {
+            break;
+        }
+        let begun_ns = raw_ns();
+        disturb();
+        times.push((begun_ns, raw_ns()));
+    }
+    times
+}
+
+/// Computes on core 1 for `busy` at random instants.
+fn hog(priority: &[&str], busy: Duration, ended: &AtomicBool) -> Times {
+    become_culprit(1, priority);
+    at_random_instants(ended, || {
+        let end_ns = raw_ns() + busy.as_nanos() as u64;
+        while raw_ns() < end_ns {
+            std::hint::spin_loop();
+        }
+    })
+}
+
+/// Returns the late ticks of which disturbances took at least half of the delay, and which no other late tick caused.
+fn planted<'a>(report: &'a LateReport, times: &Times) -> Vec<&'a LateTick> {
+    let overlap = |late: &LateTick| {
+        let from_ns = report.epoch_ns + (late.time_s * 1e9) as u64;
+        let to_ns = from_ns + (late.late_us * 1e3) as u64;
+        times.iter().map(|(begun, ended)| (*ended).min(to_ns).saturating_sub((*begun).max(from_ns))).sum::<u64>()
+    };
+    let roots = report.ticks.iter().filter(|late| late.caused_by.is_none());
+    roots.filter(|late| overlap(late) as f64 >= 500.0 * late.late_us).collect()
+}
+
+/// Asserts that the main cause of at least `part` of these late ticks is the right one.
+#[track_caller]
+fn assert_named(late: &[&LateTick], part: f64, is_right: impl Fn(&LateTick) -> bool) {
+    assert!(late.len() >= PLANTED, "{} planted late ticks", late.len());
+    let (right, wrong): (Vec<&&LateTick>, Vec<&&LateTick>) = late.iter().partition(|late| is_right(late));
+    println!("{} of {} named rightly", right.len(), late.len());
+    assert!(
+        right.len() as f64 >= part * late.len() as f64,
+        "{} of {}; wrong: {:#?}",
+        right.len(),
+        late.len(),
+        wrong.first()
+    );
+    late.iter().for_each(|late| assert_explained(late));
+}
+
+/// Asserts that the causes never explain more than the delay.
+#[track_caller]
+fn assert_explained(late: &LateTick) {
+    let sum: f64 = late.causes.iter().map(|cause| cause.us).sum();
+    assert!(sum <= late.late_us * 1.001 + 1.0, "{late:#?}");
+}
+
+fn main_cause(late: &LateTick) -> (CauseKind, &str) {
+    late.causes.first().map_or((CauseKind::Unknown, ""), |cause| (cause.kind, &cause.name))
+}
+
+/// Returns true if the test can take cores from roles; otherwise reports a skipped check.
+fn can_disturb(what: &str) -> bool {
+    let cores = rustix::thread::sched_getaffinity(None).unwrap();
+    match (rustix::process::geteuid().is_root(), cores.is_set(0) && cores.is_set(1)) {
+        (true, true) => true,
+        (false, _) => {
+            skipped(what, "it needs root");
+            false
+        }
+        (true, false) => {
+            skipped(what, "it needs cores 0 and 1");
+            false
+        }
+    }
+}
+
+/// Plants one culprit in a run with each source, and asserts that the main cause is right: by name in the kernel's trace, by kind in the
+/// counters.
+#[track_caller]
+fn assert_culprit(
+    what: &str,
+    options: &[&str],
+    disturb: impl Fn(&Bench, &AtomicBool) -> Times + Sync,
+    [named, of_kind]: [&dyn Fn(CauseKind, &str) -> bool; 2],
+) {
+    if !can_disturb(what) {
+        return;
+    }
+    let bench = Bench::new();
+    for trace in ["kernel", "counters"] {
+        let (report, times) = run_beside(&bench, trace, &[options, &["--overwrite"]].concat(), &disturb);
+        let late = planted(&report, &times);
+        let is = |right: &dyn Fn(CauseKind, &str) -> bool, late: &LateTick| {
+            let (kind, name) = main_cause(late);
+            right(kind, name)
+        };
+        if trace == "counters" {
+            assert_named(&late, 0.8, |late| is(of_kind, late));
+        } else if has_kernel_trace(&report, what) {
+            assert_named(&late, 0.95, |late| is(named, late));
+        }
+    }
+}
+
+#[test]
+fn a_task_of_higher_priority_is_named() {
+    assert_culprit(
+        "a task of higher priority as the cause of late ticks",
+        &["--set=realtime.cores=[1]"],
+        |_, ended| hog(&["chrt", "-f", "-p", "95"], Duration::from_micros(800), ended),
+        [&|kind, name| (kind, name) == (CauseKind::Task, CULPRIT), &|kind, _| kind == CauseKind::Task],
+    );
+}
+
+#[test]
+fn an_ordinary_task_beside_unprivileged_roles_is_named() {
+    assert_culprit(
+        "an ordinary task as the cause of late ticks",
+        &["--set=realtime.cores=[1]", "--set=realtime.priority=0"],
+        |_, ended| hog(&["renice", "-n", "-20", "-p"], Duration::from_millis(3), ended),
+        [&|kind, name| (kind, name) == (CauseKind::Task, CULPRIT), &|kind, _| kind == CauseKind::Task],
+    );
+}
+
+#[test]
+fn a_stop_by_a_signal_is_named() {
+    let stop = |bench: &Bench, ended: &AtomicBool| {
+        let leader = bench.await_role("leader");
+        at_random_instants(ended, || {
+            send_signal(leader, libc::SIGSTOP);
+            std::thread::sleep(Duration::from_millis(3));
+            send_signal(leader, libc::SIGCONT);
+        })
+    };
+    let stopped = |kind, _: &str| kind == CauseKind::Stopped;
+    assert_culprit("a stop by a signal as the cause of late ticks", &[], stop, [&stopped, &stopped]);
+}
