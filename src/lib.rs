@@ -7,6 +7,7 @@
 //! |---|---|
 //! | `record` | writes every sample of a run to a file; reads, replays, compares and exports it |
 //! | `hosts` | a run over several computers: relay, clocks, who may join; with the feature of that name |
+//! | `late` | late ticks and their causes |
 //! | `launch` | starts, supervises and ends a run; scores it |
 //! | `campaign` | one scenario run many times, varied; the table of its cases |
 //! | `report` | a run as one page that is looked at |
@@ -46,6 +47,7 @@ pub mod doctor;
 pub mod foxglove;
 pub mod hosts;
 pub mod launch;
+pub mod late;
 mod program;
 pub mod record;
 pub mod report;

@@ -1,0 +1,5 @@
+//! Causes of late ticks.
+
+mod cause;
+
+pub use cause::{Cause, CauseKind};
