@@ -46,8 +46,8 @@ pub mod doctor;
 #[cfg(feature = "foxglove")]
 pub mod foxglove;
 pub mod hosts;
-pub mod launch;
 pub mod late;
+pub mod launch;
 mod program;
 pub mod record;
 pub mod report;

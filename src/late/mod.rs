@@ -3,10 +3,18 @@
 //! | file | duty |
 //! |---|---|
 //! | `model` | late ticks with causes, as `late.json` has them |
+//! | `words` | late ticks in words |
 
 mod model;
+mod words;
 
 pub use corotate_trace::{Cause, CauseKind};
 pub use model::{
-    CauseTotal, LateKind, LateReport, LateTick, Pattern, SCHEMA, Slice, SliceKind, Source, TickOfRole, TracerCost,
+    CauseTotal, Chain, LateKind, LateReport, LateTick, Pattern, SCHEMA, Slice, SliceKind, Source, TickOfRole,
+    TracerCost,
 };
+pub use words::late_table;
+pub(crate) use words::{ASCII_US, header, listing, pattern};
+
+#[cfg(test)]
+pub(crate) mod fixture;

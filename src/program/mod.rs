@@ -36,6 +36,7 @@ mod shipped;
 mod signals;
 mod sweep;
 mod watch;
+mod why;
 
 use crate::bench::Row;
 use crate::bus::domain::Domain;
@@ -99,6 +100,8 @@ enum Command {
     Export(export::Arguments),
     /// Write a report of a run, a recording or a campaign (HTML)
     Report(report::Arguments),
+    /// Print the late ticks of a run with their causes
+    Why(why::Arguments),
     /// Watch a running loop on the terminal
     Watch(watch::Arguments),
     /// Serve a running loop to Foxglove (WebSocket)
@@ -267,6 +270,7 @@ fn execute(command: Option<Command>) -> Exit {
         Some(Command::Diff(arguments)) => diff::diff(&arguments),
         Some(Command::Export(arguments)) => export::export(&arguments),
         Some(Command::Report(arguments)) => report::report(&arguments),
+        Some(Command::Why(arguments)) => why::why(&arguments),
         Some(Command::Watch(arguments)) => watch::watch(&arguments),
         Some(Command::Foxglove(arguments)) => foxglove::foxglove(&arguments),
         Some(Command::Join(arguments)) => hosts::join(&arguments),
