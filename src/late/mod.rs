@@ -14,7 +14,7 @@ pub use model::{
     TracerCost,
 };
 pub use words::late_table;
-pub(crate) use words::{ASCII_US, header, listing, pattern};
+pub(crate) use words::{ASCII_US, cause_rows, header, listing, pattern, sentence, us};
 
 #[cfg(test)]
 pub(crate) mod fixture;

@@ -5,6 +5,7 @@
 use crate::config::RunId;
 use corotate_trace::{Cause, CauseKind};
 use serde::{Deserialize, Serialize};
+use std::collections::HashSet;
 
 /// Layout version of `late.json`.
 pub const SCHEMA: &str = "corotate/late/v1";
@@ -223,6 +224,25 @@ impl LateReport {
         self.ticks.iter().find(|late| late.role == role && late.covers(tick))
     }
 
+    /// Returns at most `count` of the given ticks, without those in the chain of an earlier one, and the number of ticks left out for
+    /// `count` alone.
+    pub fn heads<'a>(&'a self, ticks: &[&'a LateTick], count: usize) -> (Vec<&'a LateTick>, usize) {
+        let (mut heads, mut seen) = (Vec::new(), HashSet::new());
+        for late in ticks {
+            if heads.len() < count && !seen.contains(&std::ptr::from_ref(*late)) {
+                heads.push(*late);
+                seen.extend(self.chain(late).ticks.into_iter().map(std::ptr::from_ref));
+            }
+        }
+        let left = ticks.iter().filter(|late| !seen.contains(&std::ptr::from_ref(**late))).count();
+        (heads, left)
+    }
+
+    /// Returns the cause that explains most of the first late tick of a chain; `None` if most of it is unknown.
+    pub fn first_cause<'a>(&'a self, late: &'a LateTick) -> Option<&'a Cause> {
+        self.chain(late).ticks.last()?.main_cause()
+    }
+
     /// Follows a late tick to the late ticks of other roles that caused it.
     pub fn chain<'a>(&'a self, late: &'a LateTick) -> Chain<'a> {
         let mut chain = Chain { ticks: vec![late], open: late.caused_by.as_ref() };
@@ -312,6 +332,20 @@ mod tests {
         // The last one was not examined.
         let chain = long.chain(&long.ticks[190]);
         assert_eq!((chain.ticks.len(), chain.open), (10, tick_of("a", 200).as_ref()));
+    }
+
+    #[test]
+    fn a_tick_in_an_earlier_chain_is_no_head() {
+        let report = fixture::report();
+        let ticks = report.select(Some(755), None);
+        let (heads, left) = report.heads(&ticks, 10);
+        assert_eq!((heads.len(), heads[0].role.as_str(), left), (1, "controller", 0));
+        assert_eq!(report.first_cause(heads[0]).unwrap().kind, CauseKind::CoreTaken);
+        // 12 and 9 chains of three, and ten single ticks.
+        let (heads, left) = report.heads(&report.worst_first(), 5);
+        assert_eq!((heads.len(), heads[0].late_us, report.ticks.len()), (5, 12_400.0, 73));
+        assert_eq!(left, 73 - 3 - 2 * 3);
+        assert_eq!(report.heads(&report.worst_first(), usize::MAX).0.len(), 12 + 9 + 10);
     }
 
     #[test]

@@ -68,7 +68,7 @@ pub fn header(report: &LateReport, unit: &str) -> String {
     };
     let (counted, examined) = (report.counted, report.examined());
     let number = if counted == examined { counted.to_string() } else { format!("{examined} of {counted}") };
-    format!("{number} late ticks examined; limit {} {unit}; causes from {source}", us(report.late_us))
+    format!("{number} late ticks examined; limit {} {unit}; causes from {source}", plain(report.late_us))
 }
 
 /// Returns late ticks with their chains of causes, one cause per line.
@@ -92,6 +92,18 @@ pub fn listing(report: &LateReport, ticks: &[&LateTick], unit: &str) -> String {
     text
 }
 
+/// Returns a late tick and its chain of causes as one sentence.
+pub fn sentence(report: &LateReport, late: &LateTick, unit: &str) -> String {
+    let chain = report.chain(late);
+    let tick = |late: &&LateTick| {
+        let causes: Vec<String> =
+            parts(late).into_iter().map(|(part, cause)| format!("{cause} {} {unit}", us(part))).collect();
+        format!("{}: {}", title(late, unit), causes.join(", "))
+    };
+    let ticks = chain.ticks.iter().map(tick).chain(chain.open.map(|open| end(report, open)));
+    format!("{}.", ticks.collect::<Vec<_>>().join("; "))
+}
+
 /// Returns role, tick, time, kind and delay of a late tick.
 pub fn title(late: &LateTick, unit: &str) -> String {
     let LateTick { role, tick, ticks, .. } = late;
@@ -104,14 +116,14 @@ pub fn title(late: &LateTick, unit: &str) -> String {
         LateKind::Missed => "missed, late",
         LateKind::Starved => "starved, late",
     };
-    format!("{role} {which} at {} s: {kind} by {} {unit}", seconds(late.time_s), us(late.late_us))
+    format!("{role} {which} at {} s, {kind} by {} {unit}", plain(late.time_s), us(late.late_us))
 }
 
 /// Returns a period with which late ticks repeat, and a frequent reason for it.
 pub fn pattern(pattern: &Pattern) -> String {
     let Pattern { period_ms, ticks, of, hint } = pattern;
     let hint = hint.as_ref().map_or(String::new(), |hint| format!(": {hint}"));
-    format!("{ticks} of {of} late ticks repeat every {} ms at the same phase{hint}", seconds(*period_ms))
+    format!("{ticks} of {of} late ticks repeat every {} ms at the same phase{hint}", plain(*period_ms))
 }
 
 /// Returns the parts of a delay with their causes; an unknown rest only from 5 % on.
@@ -139,7 +151,7 @@ pub fn us(value: f64) -> String {
 }
 
 /// Formats a number without trailing zeros.
-fn seconds(value: f64) -> String {
+fn plain(value: f64) -> String {
     if value.abs() < 1e9 {
         let text = format!("{value:.6}");
         return text.trim_end_matches('0').trim_end_matches('.').to_owned();
@@ -198,11 +210,11 @@ mod tests {
         let text = listing(&report, &[report.find("controller", 755).unwrap()], "us");
         let lines: Vec<&str> = text.lines().map(str::trim_start).collect();
         let expected = [
-            "controller tick 755 at 0.755 s: late by 425.4 us",
+            "controller tick 755 at 0.755 s, late by 425.4 us",
             "420.0 us  late input from observer",
-            "observer tick 755 at 0.755 s: late by 422.1 us",
+            "observer tick 755 at 0.755 s, late by 422.1 us",
             "420.0 us  late input from leader",
-            "leader tick 755 at 0.755 s: late by 420.0 us",
+            "leader tick 755 at 0.755 s, late by 420.0 us",
             "420.0 us  core taken by the hypervisor",
         ];
         assert_eq!(lines, expected);

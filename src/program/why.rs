@@ -22,7 +22,8 @@ pub struct Arguments {
     /// Print only late ticks of this role
     #[arg(long, value_name = "ROLE")]
     role: Option<String>,
-    /// The largest number of late ticks to print
+    /// The largest number of late ticks to print; without --json each with its
+    /// whole chain
     #[arg(short = 'n', value_name = "COUNT", default_value = "10")]
     count: NonZeroUsize,
     /// Print them as one JSON object (corotate/why/v1)
@@ -36,7 +37,8 @@ const SCHEMA: &str = "corotate/why/v1";
 const EXAMPLES: &str = "\
 Prints late, missed and starved ticks, the longest delay first. Below each one
 are its causes with the time that each explains, and the late tick of another
-role that caused it. `unknown` is the time that no observed cause explains.
+role that caused it, which is not printed again. `unknown` is the time that no
+observed cause explains.
 
 Examples:
   corotate why                     the newest run in runs/
@@ -75,11 +77,11 @@ pub fn why(arguments: &Arguments) -> CommandResult {
     let run = open(arguments.run.as_deref()).map_err(|(exit, failure)| fail(exit, failure))?;
     run.check(arguments).map_err(|failure| fail(Exit::Usage, failure))?;
     let selected = run.late.select(arguments.tick, arguments.role.as_deref());
-    let shown = &selected[..selected.len().min(arguments.count.get())];
     if arguments.json {
+        let shown = &selected[..selected.len().min(arguments.count.get())];
         return say(&json(&run, shown, selected.len()));
     }
-    say(&harmless(&text(&run.late, arguments, shown, selected.len())))
+    say(&harmless(&text(&run.late, arguments, &selected)))
 }
 
 /// Opens the run that the command line names.
@@ -152,8 +154,9 @@ impl Run {
     }
 }
 
-/// Returns the shown late ticks of all `selected` as text.
-fn text(late: &LateReport, arguments: &Arguments, shown: &[&LateTick], selected: usize) -> String {
+/// Returns the selected late ticks as text. A tick in the chain of an earlier one is not listed again.
+fn text(late: &LateReport, arguments: &Arguments, selected: &[&LateTick]) -> String {
+    let (shown, left) = late.heads(selected, arguments.count.get());
     let mut text = format!("{}: {}\n", late.scenario, header(late, ASCII_US));
     // Writing to a string does not fail.
     if let Some(note) = &late.note {
@@ -163,9 +166,9 @@ fn text(late: &LateReport, arguments: &Arguments, shown: &[&LateTick], selected:
         let _ = writeln!(text, "{}", nothing(late, arguments));
         return text;
     }
-    let _ = write!(text, "\n{}", listing(late, shown, ASCII_US));
-    if selected > shown.len() {
-        let _ = writeln!(text, "\n{} more: -n {selected} prints them", selected - shown.len());
+    let _ = write!(text, "\n{}", listing(late, &shown, ASCII_US));
+    if left > 0 {
+        let _ = writeln!(text, "\n{left} more: -n {} prints them", shown.len() + left);
     }
     if arguments.tick.is_none() && !late.patterns.is_empty() {
         text.push('\n');
