@@ -51,9 +51,9 @@ pub fn report() -> LateReport {
         causes: totals(&ticks),
         ticks,
         patterns: vec![Pattern {
+            of: 73,
             period_ms: 100.0,
             ticks: 12,
-            of: 73,
             hint: Some("a processor quota has this period, here or on the host of a virtual machine".to_owned()),
         }],
         tracer: Some(TracerCost { cpu_s: 0.41, events: 212_300, overruns: 0 }),

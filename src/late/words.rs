@@ -121,9 +121,9 @@ pub fn title(late: &LateTick, unit: &str) -> String {
 
 /// Returns a period with which late ticks repeat, and a frequent reason for it.
 pub fn pattern(pattern: &Pattern) -> String {
-    let Pattern { period_ms, ticks, of, hint } = pattern;
+    let Pattern { of: compared, period_ms, ticks, hint } = pattern;
     let hint = hint.as_ref().map_or(String::new(), |hint| format!(": {hint}"));
-    format!("{ticks} of {of} late ticks repeat every {} ms at the same phase{hint}", plain(*period_ms))
+    format!("{ticks} of {compared} late ticks repeat every {} ms at the same phase{hint}", plain(*period_ms))
 }
 
 /// Returns the parts of a delay with their causes; an unknown rest only from 5 % on.

@@ -23,6 +23,7 @@ mod identify;
 mod init;
 mod new;
 mod output;
+mod perfetto;
 mod record;
 mod replay;
 mod report;

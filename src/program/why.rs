@@ -1,7 +1,7 @@
 //! `corotate why`: prints the late ticks of a run with their causes.
 
-use super::output::{CommandResult, Exit, Failure, fail, harmless, say};
-use super::runs;
+use super::output::{CommandResult, Exit, Failure, fail, harmless, remark, say};
+use super::{perfetto, runs};
 use crate::files;
 use crate::late::{ASCII_US, LateReport, LateTick, TickOfRole, header, listing, pattern};
 use crate::launch::{LATE, SUMMARY, Summary};
@@ -26,6 +26,10 @@ pub struct Arguments {
     /// whole chain
     #[arg(short = 'n', value_name = "COUNT", default_value = "10")]
     count: NonZeroUsize,
+    /// Also write the whole run to this file, as a trace for
+    /// https://ui.perfetto.dev: late ticks, cores, samples if recorded
+    #[arg(long, value_name = "FILE")]
+    perfetto: Option<PathBuf>,
     /// Print them as one JSON object (corotate/why/v1)
     #[arg(long)]
     json: bool,
@@ -44,7 +48,8 @@ Examples:
   corotate why                     the newest run in runs/
   corotate why runs/pair --tick 3277
                                    every role at that tick
-  corotate why --role controller -n 50";
+  corotate why --role controller -n 50
+  corotate why --perfetto trace.json";
 
 /// A run with its late ticks.
 struct Run {
@@ -76,6 +81,11 @@ impl<'a> ShownTick<'a> {
 pub fn why(arguments: &Arguments) -> CommandResult {
     let run = open(arguments.run.as_deref()).map_err(|(exit, failure)| fail(exit, failure))?;
     run.check(arguments).map_err(|failure| fail(Exit::Usage, failure))?;
+    if let Some(out) = &arguments.perfetto {
+        let written = perfetto::write(&run.directory, &run.late, out);
+        written.map_err(|(exit, failure)| fail(exit, failure))?;
+        remark(&format!("{}: open it at https://ui.perfetto.dev", out.display()));
+    }
     let selected = run.late.select(arguments.tick, arguments.role.as_deref());
     if arguments.json {
         let shown = &selected[..selected.len().min(arguments.count.get())];

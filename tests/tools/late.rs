@@ -68,7 +68,7 @@ fn late_ticks_are_selected_by_tick_role_and_number() {
     let [follower, controller, leader] = [("follower", 300), ("controller", 755), ("leader", 755)]
         .map(|(role, tick): (&str, u64)| (role.to_owned(), tick));
     assert_eq!(printed(&bench, &[]), [follower.clone(), controller.clone(), leader.clone()]);
-    assert_eq!(printed(&bench, &["-n", "1"]), [follower.clone()]);
+    assert_eq!(printed(&bench, &["-n", "1"]), std::slice::from_ref(&follower));
     assert_eq!(printed(&bench, &["--tick", "755"]), [controller, leader.clone()]);
     assert_eq!(printed(&bench, &["--tick", "302"]), [follower]);
     assert_eq!(printed(&bench, &["--role", "leader", "--tick", "755"]), [leader]);
@@ -106,6 +106,36 @@ fn what_the_run_does_not_have_is_refused() {
     assert!(refused(&[], "no-late-ticks").contains("realtime"));
     fs::remove_file(directory.join("summary.json")).unwrap();
     refused(&[], "no-results");
+}
+
+/// A run in real time with a recording: every sample is on the axis of the late ticks.
+#[test]
+fn a_trace_has_late_ticks_cores_and_samples_on_one_axis() {
+    let bench = Bench::new();
+    let common = ["run", "rigid-pair", "--clock", "realtime", "--duration", "1", "--set", "accept={}"];
+    bench.run(&[&common[..], &["--record", "--out", "run"]].concat()).succeeded();
+    let directory = bench.path("run");
+    write_late(&directory, &late_report(&summary_in(&directory)["run"]));
+    why(&bench, &["--perfetto", "trace.json"]).succeeded();
+    let trace: Value = serde_json::from_slice(&fs::read(bench.path("trace.json")).unwrap()).unwrap();
+    let events = trace["traceEvents"].as_array().unwrap();
+    let with = |phase: &'static str| events.iter().filter(move |event| event["ph"] == phase);
+    let samples: Vec<&Value> = with("i").collect();
+    // Four roles send at least one sample per tick.
+    assert!(samples.len() > 4 * 800, "{}", samples.len());
+    for sample in samples {
+        let (at, tick) = (sample["ts"].as_f64().unwrap(), sample["args"]["tick"].as_f64().unwrap());
+        assert!(at >= 1000.0 * tick && at < 1000.0 * tick + 500_000.0, "{sample}");
+    }
+    let late = with("X")
+        .find(|event| event["args"]["about"].as_str().is_some_and(|about| about.starts_with("leader")))
+        .unwrap();
+    assert_eq!((&late["ts"], &late["dur"]), (&json!(755_000.0), &json!(900.0)));
+    assert!(with("X").any(|event| event["name"] == "<hog>" && event["ts"] == 755_002.0 && event["dur"] == 890.0));
+    let refused = why(&bench, &["--perfetto", "run/run.mcap"]);
+    assert!(refused.code == Some(2) && refused.codes() == ["same-file"], "{refused:?}");
+    let refused = why(&bench, &["--perfetto", "no/such/file"]);
+    assert!(refused.code == Some(1) && refused.codes() == ["cannot-write"], "{refused:?}");
 }
 
 #[test]
