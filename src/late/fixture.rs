@@ -14,7 +14,7 @@ pub fn report() -> LateReport {
     let mut ticks = Vec::new();
     for index in 0..12_u64 {
         let us = 420.0 + 37.0 * ((index * 7) % 13) as f64;
-        chain(755 + 800 * index, us, Cause::new(CauseKind::CoreTaken, "", us as u64 * 1000), &mut ticks);
+        chain(755 + 800 * index, us, Cause::new(CauseKind::CoreTaken, "hypervisor", us as u64 * 1000), &mut ticks);
     }
     for index in 0..9_u64 {
         let us = 160.0 + 90.0 * ((index * 5) % 9) as f64;
@@ -22,8 +22,8 @@ pub fn report() -> LateReport {
         chain(402 + 1091 * index, us, hog, &mut ticks);
     }
     let single = [
-        (CauseKind::LateTimer, "", 917.0),
-        (CauseKind::LateTimer, "", 341.0),
+        (CauseKind::LateTimer, "idle core", 917.0),
+        (CauseKind::LateTimer, "idle core", 341.0),
         (CauseKind::Softirq, "NET_RX", 188.0),
         (CauseKind::Interrupt, "virtio0-req.0", 131.0),
         (CauseKind::PageFault, "", 214.0),
