@@ -108,6 +108,33 @@ fn what_the_run_does_not_have_is_refused() {
     refused(&[], "no-results");
 }
 
+#[test]
+fn the_report_has_a_section_only_if_there_are_late_ticks() {
+    let bench = Bench::new();
+    let directory = run_with_late_ticks(&bench);
+    let page = || {
+        let done = bench.run(&["report", "run"]).succeeded();
+        (fs::read_to_string(directory.join("report.html")).unwrap(), done.stderr)
+    };
+    let (html, _) = page();
+    assert!(html.contains("<section id=\"late\">") && html.contains("cores around tick 755 of leader"));
+    assert!(html.contains("&lt;hog&gt;") && !html.contains("<hog>"), "{html}");
+    fs::remove_file(directory.join("late.json")).unwrap();
+    let (html, remarks) = page();
+    assert!(!html.contains("<section id=\"late\">") && !remarks.contains("late ticks"), "{remarks}");
+    // A run in real time always has late.json, unless it was switched off.
+    let summary = fs::read_to_string(directory.join("summary.json")).unwrap();
+    fs::write(
+        directory.join("summary.json"),
+        summary
+            .replace("\"clock\":\"in-process\"", "\"clock\":\"realtime\"")
+            .replace("\"clock\": \"in-process\"", "\"clock\": \"realtime\""),
+    )
+    .unwrap();
+    let (html, remarks) = page();
+    assert!(!html.contains("<section id=\"late\">") && remarks.contains("late ticks"), "{remarks}");
+}
+
 /// A run in real time with a recording: every sample is on the axis of the late ticks.
 #[test]
 fn a_trace_has_late_ticks_cores_and_samples_on_one_axis() {
