@@ -61,7 +61,7 @@ pub fn report(
         counted: counted
             .map(|ticks| ticks.missed - ticks.scripted.min(ticks.missed) + ticks.starved + ticks.late.unwrap_or(0))
             .sum(),
-        examined: ticks.len() as u64,
+        examined: ticks.iter().fold(0, |sum, late| sum.saturating_add(late.ticks)),
         ticks,
         causes: Vec::new(),
         patterns: Vec::new(),

@@ -8,17 +8,28 @@
 //! | `explain` | causes from the kernel's events: their names |
 //! | `tracer` | the process that records the kernel's trace beside a run |
 //! | `assemble` | the report of a run, with chains of roles and totals by cause |
+//! | `words` | late ticks in words |
+//! | `perfetto` | late ticks and samples as a Chrome trace |
 
 mod assemble;
 mod counters;
 mod delay;
 mod explain;
 mod model;
+mod perfetto;
 mod tracer;
+mod words;
 
 pub use assemble::report;
 pub use corotate_trace::{Cause, CauseKind};
 pub use model::{
-    CauseTotal, LateKind, LateReport, LateTick, Pattern, SCHEMA, Slice, SliceKind, Source, TickOfRole, TracerCost,
+    CauseTotal, Chain, LateKind, LateReport, LateTick, Pattern, SCHEMA, Slice, SliceKind, Source, TickOfRole,
+    TracerCost,
 };
+pub use perfetto::{Perfetto, SampleMark};
 pub use tracer::{Findings, TRACER, findings, ready_path, remove_dead_traces, run_tracer};
+pub use words::late_table;
+pub(crate) use words::{ASCII_US, cause_rows, header, listing, pattern, sentence, us};
+
+#[cfg(test)]
+pub(crate) mod fixture;

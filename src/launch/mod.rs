@@ -46,7 +46,7 @@ pub(crate) use outcome::{State, state_hash};
 pub(crate) use processes::new_domain;
 pub use replay::replay_as_process;
 pub use results::{Claim, LATEST, RUNS, ResultsError, claim, make_directory, make_latest, new_run};
-pub(crate) use results::{GENERATOR, LATENCY, RECORDING, SCENARIO, SUMMARY};
+pub(crate) use results::{GENERATOR, LATE, LATENCY, RECORDING, SCENARIO, SUMMARY};
 pub use steps::{BodyState, Steps};
 pub(crate) use summary::Judged;
 pub use summary::{Summary, write_run};

@@ -253,8 +253,9 @@ fn failed(path: &Path) -> impl FnOnce(io::Error) -> ResultsError {
 
 /// Returns the files of an older run that have the names of a run's files.
 fn older(directory: &Path) -> Result<Vec<PathBuf>, ResultsError> {
-    let kinds: [(&str, IsOurs); 5] = [
+    let kinds: [(&str, IsOurs); 6] = [
         (SUMMARY, is_summary),
+        (LATE, is_late_report),
         (SCENARIO, names_run),
         (HASHES, names_run),
         (RECORDING, is_recording),
@@ -301,13 +302,22 @@ fn names_run(bytes: &[u8]) -> bool {
 }
 
 fn is_summary(bytes: &[u8]) -> bool {
+    is_json_of(bytes, "corotate/summary/")
+}
+
+fn is_late_report(bytes: &[u8]) -> bool {
+    is_json_of(bytes, "corotate/late/")
+}
+
+/// Returns true if the file is a run's JSON object whose schema begins with `schema`.
+fn is_json_of(bytes: &[u8], schema: &str) -> bool {
     #[derive(Deserialize)]
     struct Head {
         schema: String,
         #[serde(rename = "run")]
         _run: RunId,
     }
-    serde_json::from_slice::<Head>(bytes).is_ok_and(|head| head.schema.starts_with("corotate/summary/"))
+    serde_json::from_slice::<Head>(bytes).is_ok_and(|head| head.schema.starts_with(schema))
 }
 
 fn is_recording(bytes: &[u8]) -> bool {
@@ -332,16 +342,19 @@ mod tests {
     /// A file of another program with the name of ours is kept, and so is everything beside it.
     #[test]
     fn a_foreign_file_refuses_the_directory_and_nothing_is_removed() {
-        let names = ["summary.json", "scenario.toml", "hashes.txt", "run.mcap", "report.html", "latency/a.step.hgrm"];
-        for name in names {
+        let names = ["summary.json", "late.json", "scenario.toml", "hashes.txt", "run.mcap", "report.html"];
+        for name in names.into_iter().chain(["latency/a.step.hgrm"]) {
             let directory = tempfile::tempdir().unwrap();
             let path = directory.path().join(name);
             fs::create_dir_all(path.parent().unwrap()).unwrap();
             let ours = directory.path().join(if name == "hashes.txt" { "scenario.toml" } else { "hashes.txt" });
             fs::write(&ours, format!("# {}", new_run().unwrap().comment())).unwrap();
-            for content in
-                ["name = \"mine\"\n", "{\"schema\":\"corotate/summary/v1\"}", "\u{89}MCAP0 of another program"]
-            {
+            for content in [
+                "name = \"mine\"\n",
+                "{\"schema\":\"corotate/summary/v1\"}",
+                "{\"schema\":\"corotate/late/v1\"}",
+                "\u{89}MCAP0 of another program",
+            ] {
                 fs::write(&path, content).unwrap();
                 let refused = claim(directory.path(), new_run().unwrap(), true).unwrap_err();
                 assert!(matches!(&refused, ResultsError::Foreign { path: told } if *told == path), "{refused}");
@@ -361,8 +374,10 @@ mod tests {
         fs::create_dir(at("latency")).unwrap();
         let kept = ["notes.txt", "latency/notes.txt", "verdict.xml"].map(at);
         kept.iter().for_each(|path| fs::write(path, "mine").unwrap());
-        let gone = ["scenario.toml", "latency/latency.hlog"].map(at);
+        let gone = ["late.json", "scenario.toml", "latency/latency.hlog"].map(at);
         gone.iter().for_each(|path| fs::write(path, format!("#[{}]", new_run().unwrap().comment())).unwrap());
+        let late = serde_json::json!({ "schema": "corotate/late/v9", "run": new_run().unwrap() });
+        fs::write(&gone[0], late.to_string()).unwrap();
         fs::write(at("run.mcap"), "").unwrap();
         let run = || new_run().unwrap();
         assert!(matches!(claim(directory.path(), run(), false), Err(ResultsError::Finished { .. })));

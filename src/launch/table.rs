@@ -4,6 +4,7 @@ use super::outcome::{LinkCounters, State};
 use super::{Incident, Summary, exact, short};
 use crate::analysis::digits;
 use crate::hosts::{NetworkStatistics, Silence};
+use crate::late::{late_table, pattern};
 use crate::serial::LineCounters;
 use crate::telemetry::Percentiles;
 use comfy_table::presets::NOTHING;
@@ -15,6 +16,9 @@ use std::fmt::Write;
 const RESULT_ROWS: usize = 8;
 /// The end of a serial line's text if it had no fault.
 const NO_FAULT: &str = "; no fault";
+/// Lines of late ticks by cause, by default and with all.
+const LATE_LINES: usize = 4;
+const LATE_LINES_ALL: usize = 8;
 /// Incidents that are shown by default.
 const INCIDENTS: usize = 4;
 
@@ -52,6 +56,10 @@ pub fn table(summary: &Summary, all: bool) -> String {
         let critical = Some(critical_latencies(summary)).filter(|rows| !all && !rows.is_empty());
         let rows = critical.unwrap_or_else(|| latencies(summary));
         let _ = writeln!(text, "\n{rows}{}", stamps_ahead(summary));
+    }
+    if let Some(late) = summary.late.as_ref().filter(|late| !late.causes.is_empty()) {
+        let _ = write!(text, "\n{}", late_table(late, if all { LATE_LINES_ALL } else { LATE_LINES }));
+        late.patterns.iter().filter(|_| all).for_each(|found| _ = writeln!(text, "{}", pattern(found)));
     }
     counters(summary, all, &mut text);
     watchdog(summary, all, &mut text);
@@ -247,10 +255,9 @@ fn counters(summary: &Summary, all: bool, text: &mut String) {
     );
     let late = books.roles.iter().filter_map(|(role, ticks)| Some((role, ticks.late.filter(|late| *late > 0)?)));
     let late: Vec<(&String, u64)> = late.collect();
-    if let (Some(late_us), Some((role, most))) = (summary.late_us, late.iter().max_by_key(|(_, ticks)| *ticks)) {
-        let _ = write!(text, "executed ticks late by more than {} us: ", digits(late_us));
-        let by_role = || late.iter().map(|(role, ticks)| format!("{role} {ticks}")).collect::<Vec<_>>().join(", ");
-        let _ = if all { writeln!(text, "{}", by_role()) } else { writeln!(text, "most at {role}, {most}") };
+    if let (Some(late_us), true) = (summary.late_us, all && !late.is_empty()) {
+        let by_role = late.iter().map(|(role, ticks)| format!("{role} {ticks}")).collect::<Vec<_>>().join(", ");
+        let _ = writeln!(text, "executed ticks late by more than {} us: {by_role}", digits(late_us));
     }
     if books.injected_faults > 0 {
         let _ = writeln!(text, "scripted faults: acted {} times", books.injected_faults);

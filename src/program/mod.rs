@@ -23,6 +23,7 @@ mod identify;
 mod init;
 mod new;
 mod output;
+mod perfetto;
 mod record;
 mod replay;
 mod report;
@@ -37,6 +38,7 @@ mod signals;
 mod sweep;
 mod tracer;
 mod watch;
+mod why;
 
 use crate::bench::Row;
 use crate::bus::domain::Domain;
@@ -100,6 +102,8 @@ enum Command {
     Export(export::Arguments),
     /// Write a report of a run, a recording or a campaign (HTML)
     Report(report::Arguments),
+    /// Print the late ticks of a run with their causes
+    Why(why::Arguments),
     /// Watch a running loop on the terminal
     Watch(watch::Arguments),
     /// Serve a running loop to Foxglove (WebSocket)
@@ -271,6 +275,7 @@ fn execute(command: Option<Command>) -> Exit {
         Some(Command::Diff(arguments)) => diff::diff(&arguments),
         Some(Command::Export(arguments)) => export::export(&arguments),
         Some(Command::Report(arguments)) => report::report(&arguments),
+        Some(Command::Why(arguments)) => why::why(&arguments),
         Some(Command::Watch(arguments)) => watch::watch(&arguments),
         Some(Command::Foxglove(arguments)) => foxglove::foxglove(&arguments),
         Some(Command::Join(arguments)) => hosts::join(&arguments),

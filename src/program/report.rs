@@ -123,6 +123,7 @@ fn exit_of(error: &ReportError) -> Exit {
         ReportError::Nothing { .. }
         | ReportError::NoRun { .. }
         | ReportError::Summary { .. }
+        | ReportError::LateTicks { .. }
         | ReportError::Latency { .. }
         | ReportError::TwoRuns { .. }
         | ReportError::Campaign(_)

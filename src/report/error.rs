@@ -44,6 +44,15 @@ pub enum ReportError {
         /// The part that is invalid.
         reason: String,
     },
+    /// The late ticks are not of this version.
+    #[error("cannot read {}: {reason}; remove it, or use the version of corotate that wrote it", path.display())]
+    #[strum(serialize = "unreadable-late-ticks")]
+    LateTicks {
+        /// The file.
+        path: PathBuf,
+        /// The part that is invalid.
+        reason: String,
+    },
     /// A latency distribution is invalid.
     #[error("{} is not a percentile distribution: {reason}; remove it, or run again", path.display())]
     #[strum(serialize = "unreadable-latency")]

@@ -13,6 +13,7 @@
 //! | `pair` | the page of two runs |
 //! | `pictures` | charts from the samples of a run |
 //! | `tables` | tables from the summary |
+//! | `late`, `timeline` | late ticks with their causes; the cores around one |
 //! | `campaign` | the page of a campaign |
 //! | `axis`, `frame`, `chart` | charts as SVG |
 //! | `html`, `page` | HTML |
@@ -28,6 +29,7 @@ mod error;
 mod frame;
 mod hidden;
 mod html;
+mod late;
 mod model;
 mod page;
 mod pair;
@@ -36,6 +38,7 @@ mod pictures;
 mod single;
 mod source;
 mod tables;
+mod timeline;
 mod traces;
 
 pub use error::ReportError;

@@ -98,8 +98,14 @@ fn block(block: &Block, html: &mut String) {
         Block::Table { .. } => {}
         Block::Figures(figures) => {
             let wide = if figures.iter().all(|(picture, _)| picture.is_wide()) { " wide" } else { "" };
+            let shared = shares_legend(figures);
+            if shared {
+                html.push_str("<p class=\"scale\">");
+                legend(&figures[0].0, html);
+                html.push_str("</p>\n");
+            }
             let _ = writeln!(html, "<div class=\"figures{wide}\">");
-            figures.iter().for_each(|(picture, caption)| figure(picture, caption, html));
+            figures.iter().for_each(|(picture, caption)| figure(picture, caption, !shared, html));
             html.push_str("</div>\n");
         }
         Block::Scale(labels) => {
@@ -155,7 +161,24 @@ fn table(caption: &str, head: &[String], rows: &[Vec<String>], html: &mut String
     html.push_str("</tbody></table></div>\n");
 }
 
-fn figure(picture: &Picture, caption: &str, html: &mut String) {
+/// Returns true if all figures of a block have the same legend, and they are so many that it is written once above them.
+fn shares_legend(figures: &[(Picture, String)]) -> bool {
+    const MANY: usize = 4;
+    let equal = |pair: &[(Picture, String)]| pair[0].0.legend == pair[1].0.legend;
+    figures.len() > MANY && figures.windows(2).all(equal) && !figures[0].0.legend.is_empty()
+}
+
+fn legend(picture: &Picture, html: &mut String) {
+    for (class, label) in &picture.legend {
+        let _ = write!(
+            html,
+            "<span class=\"key\"><svg width=\"34\" height=\"10\"><path class=\"line {class}\" d=\"M1 5H33\"/></svg>{}</span> ",
+            escape(label)
+        );
+    }
+}
+
+fn figure(picture: &Picture, caption: &str, with_legend: bool, html: &mut String) {
     html.push_str("<figure>\n");
     let _ = match &picture.narrow {
         None => write!(html, "{}\n<figcaption>", picture.svg),
@@ -167,12 +190,8 @@ fn figure(picture: &Picture, caption: &str, html: &mut String) {
             )
         }
     };
-    for (class, label) in &picture.legend {
-        let _ = write!(
-            html,
-            "<span class=\"key\"><svg width=\"34\" height=\"10\"><path class=\"line {class}\" d=\"M1 5H33\"/></svg>{}</span> ",
-            escape(label)
-        );
+    if with_legend {
+        legend(picture, html);
     }
     let _ = writeln!(html, "<span class=\"caption\">{}</span></figcaption>\n</figure>", escape(caption));
 }

@@ -8,7 +8,7 @@ use super::model::{Model, latency_section};
 use super::pictures::Frames;
 use super::source::Source;
 use super::traces::{Traces, trace};
-use super::{percentiles, pictures, tables};
+use super::{late, percentiles, pictures, tables};
 
 /// Builds the page of a run, with the fields named by `shown`.
 pub fn model(source: &Source, shown: &[String]) -> Result<Model, ReportError> {
@@ -25,10 +25,11 @@ pub fn model(source: &Source, shown: &[String]) -> Result<Model, ReportError> {
     }
     let (time, events) = times(source, traces.as_ref());
     let (marks, whole) = marks(&time, &events);
+    let frames = Frames { time: &time, whole };
     let mut sections = vec![tables::verdict(source, traces.as_ref())];
     if let Some(traces) = &traces {
         let full = source.scenario.as_ref().map_or(Ok(None), counterpart)?;
-        sections.extend(pictures::sections(source, traces, full.as_ref(), &Frames { time: &time, whole }, shown)?);
+        sections.extend(pictures::sections(source, traces, full.as_ref(), &frames, shown)?);
     }
     let latencies = percentiles::pictures(&source.curves);
     if !latencies.is_empty() {
@@ -37,6 +38,7 @@ pub fn model(source: &Source, shown: &[String]) -> Result<Model, ReportError> {
     if let Some(traces) = &traces {
         sections.push(pictures::lateness(source, traces, &time));
     }
+    sections.extend(source.late.as_ref().map(|report| late::section(report, &frames)));
     sections.push(tables::events(source, traces.as_ref()));
     sections.push(tables::books(source));
     sections.push(tables::certificate(source));
@@ -74,7 +76,8 @@ fn headings(source: &Source) -> (String, String) {
 /// Returns the time axis of all charts and its marks.
 fn times(source: &Source, traces: Option<&Traces>) -> (Axis, Marks) {
     let tick_s = source.scenario.as_ref().map_or(0.0, |scenario| scenario.tick_s());
-    let last = traces.and_then(|traces| traces.ticks).map_or(1, |(_, last)| last.max(1));
+    let recorded = traces.and_then(|traces| traces.ticks).map(|(_, last)| last);
+    let last = recorded.or(source.summary.as_ref().map(|summary| summary.last_tick)).unwrap_or(1).max(1);
     let time = Axis::time(last as f64 * tick_s);
     let faults = tables::faults(source).into_iter().filter(|fault| fault.from_tick <= last);
     let span = |fault: tables::FaultRow| {

@@ -6,7 +6,8 @@ use super::error::ReportError;
 use super::percentiles::{Curve, read_curve};
 use crate::config::{ClockKind, RunId};
 use crate::files;
-use crate::launch::{LATENCY, RECORDING, SCENARIO, SUMMARY, Summary};
+use crate::late::LateReport;
+use crate::launch::{LATE, LATENCY, RECORDING, SCENARIO, SUMMARY, Summary};
 use crate::record::Recording;
 use crate::scenario::Scenario;
 use std::fs;
@@ -20,6 +21,7 @@ pub struct Source {
     pub scenario: Option<Scenario>,
     pub recording: Option<Recording>,
     pub curves: Vec<Curve>,
+    pub late: Option<LateReport>,
     /// A remark for each missing part: what is missing, and how to get it.
     pub missing: Vec<String>,
 }
@@ -43,6 +45,7 @@ impl Source {
             scenario: Some(recording.scenario()?),
             recording: Some(recording),
             curves: Vec::new(),
+            late: None,
             missing: vec![missing.to_owned()],
         })
     }
@@ -81,7 +84,12 @@ impl Source {
             };
             missing.push(format!("latencies are missing: {reason}"));
         }
-        let found = Self { summary, scenario, recording, curves, missing };
+        let late = late_ticks(&at(LATE))?;
+        if late.is_none() && summary.as_ref().is_some_and(|summary| summary.clock == ClockKind::Realtime.name()) {
+            let reason = "realtime.trace was \"off\", or an older version made the run";
+            missing.push(format!("the causes of late ticks are missing: {reason}"));
+        }
+        let found = Self { summary, scenario, recording, curves, late, missing };
         found.require_one_run(path)?;
         Ok(found)
     }
@@ -95,6 +103,7 @@ impl Source {
         // Without scenario.toml the scenario comes from the recording, and has no run identifier.
         let scenario = self.scenario.as_ref().filter(|_| directory.join(SCENARIO).exists());
         files.extend(scenario.map(|scenario| file(SCENARIO, scenario.run)));
+        files.extend(self.late.as_ref().map(|late| file(LATE, late.run)));
         let curve = |curve: &Curve| file(&format!("{LATENCY}/{}.{}.hgrm", curve.role, curve.stage), curve.run);
         files.extend(self.curves.iter().map(curve));
         let Some((first, rest)) = files.split_first() else { return Ok(()) };
@@ -115,6 +124,17 @@ impl Source {
 fn text(path: &Path) -> Result<Option<String>, ReportError> {
     match files::open(path).and_then(io::read_to_string) {
         Ok(text) => Ok(Some(text)),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        Err(source) => Err(ReportError::Read { path: path.to_owned(), source }),
+    }
+}
+
+/// Reads the late ticks; returns `None` if the file does not exist.
+fn late_ticks(path: &Path) -> Result<Option<LateReport>, ReportError> {
+    match files::read(path) {
+        Ok(bytes) => LateReport::parse(&bytes)
+            .map(Some)
+            .map_err(|reason| ReportError::LateTicks { path: path.to_owned(), reason }),
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
         Err(source) => Err(ReportError::Read { path: path.to_owned(), source }),
     }

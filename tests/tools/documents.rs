@@ -10,7 +10,7 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 
 /// Commands that are not run here: first words, and where the command is run or why it cannot be.
-const ELSEWHERE: [(&str, &str); 30] = [
+const ELSEWHERE: [(&str, &str); 31] = [
     ("corotate run pair.toml --host", "it waits for another host; tests/runs/hosts"),
     ("corotate run pair.toml --clock lockstep --debug", "it waits for a debugger; tests/runs/debugging.rs"),
     ("corotate join", "it needs a run to join; tests/runs/hosts"),
@@ -35,6 +35,7 @@ const ELSEWHERE: [(&str, &str); 30] = [
     ("qemu-system-arm", "it needs firmware; tests/board"),
     ("socat", "it goes on until it is ended; tests/runs/serial.rs has a line of its own"),
     ("cargo run --release --example serial_device", "it needs a line; tests/runs/serial.rs"),
+    ("corotate why", "it needs a run with late ticks; tests/tools/late.rs"),
     ("corotate watch --once", "during a run, below"),
     ("corotate watch runs/pair", "a screen that is left by a key; tests/tools/watch.rs, in a terminal"),
     ("corotate watch", "a screen that is left by a key; tests/tools/watch.rs, in a terminal"),

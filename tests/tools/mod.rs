@@ -8,5 +8,6 @@ mod doctor;
 mod documents;
 #[cfg(feature = "foxglove")]
 mod foxglove;
+mod late;
 mod report;
 mod watch;

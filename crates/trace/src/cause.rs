@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 
 /// The kind of a cause.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, strum::IntoStaticStr)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, strum::IntoStaticStr, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
 pub enum CauseKind {
@@ -42,7 +42,7 @@ pub enum CauseKind {
 pub struct Cause {
     /// The kind.
     pub kind: CauseKind,
-    /// The name of the task, interrupt, softirq or sending role; empty if there is none.
+    /// The name of the task, interrupt, softirq or sending role; otherwise empty.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub name: String,
     /// The thread identifier of a task.
@@ -62,8 +62,8 @@ impl Cause {
     }
 
     /// Returns true if both are the same cause, whatever they explain. Threads of one name count as one cause.
-    pub fn same(&self, other: &Self) -> bool {
-        (self.kind, &self.name) == (other.kind, &other.name)
+    pub fn same(&self, cause: &Self) -> bool {
+        (self.kind, &self.name) == (cause.kind, &cause.name)
     }
 }
 
