@@ -219,7 +219,7 @@ fn patterns(report: &LateReport) -> Vec<Pattern> {
             cause: cause.clone(),
             period_ms: period.period_ms,
             ticks: period.same_phase,
-            of: period.events,
+            compared: period.events,
             hint: (!period.hint.is_empty()).then(|| period.hint.to_owned()),
         })
     });

@@ -54,7 +54,7 @@ pub fn report() -> LateReport {
         ticks,
         patterns: vec![Pattern {
             cause: "core taken by the hypervisor".to_owned(),
-            of: 73,
+            compared: 73,
             period_ms: 100.0,
             ticks: 12,
             hint: Some("a processor quota has this period, here or on the host of a virtual machine".to_owned()),

@@ -165,7 +165,7 @@ pub struct Pattern {
     /// The number of late ticks at the same phase.
     pub ticks: u64,
     /// The number of late ticks that were compared.
-    pub of: u64,
+    pub compared: u64,
     /// A frequent reason for this period, if there is one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub hint: Option<String>,

@@ -44,7 +44,7 @@ const TIMELINES: usize = 10;
 /// The number of late ticks, the longest delays first, that are explained at each look: beside more the trace would cost a core.
 const EXPLAINED: usize = 100;
 
-/// What the process found.
+/// Findings of the process.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Findings {
     /// The reason for which there is no trace, with the remedy.
@@ -66,7 +66,7 @@ pub struct Finding {
     pub delay_ns: u64,
     /// The causes.
     pub causes: Vec<Cause>,
-    /// What kept the sender of its last input from sending that, if no late tick of the sender tells it.
+    /// Causes that kept the sender of its last input from sending it, for a sender without a late tick of its own.
     pub input_causes: Vec<Cause>,
     /// The cores around it, if it is one of the worst ticks.
     pub slices: Vec<Slice>,

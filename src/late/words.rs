@@ -119,7 +119,7 @@ pub fn title(late: &LateTick, unit: &str) -> String {
 
 /// Returns a period with which late ticks repeat, and a frequent reason for it.
 pub fn pattern(pattern: &Pattern) -> String {
-    let Pattern { cause, of: compared, period_ms, ticks, hint } = pattern;
+    let Pattern { cause, compared, period_ms, ticks, hint } = pattern;
     let hint = hint.as_ref().map_or(String::new(), |hint| format!(": {hint}"));
     format!("{cause}: {ticks} of {compared} late ticks every {} ms at the same phase{hint}", plain(*period_ms))
 }

@@ -86,7 +86,7 @@ impl Window {
         Self { from_ns, to_ns, events, cores, lost }
     }
 
-    /// Returns true if events are missing in it, so that no cause can be told.
+    /// Returns true if events are missing in it, so that no cause is certain.
     pub fn has_losses(&self) -> bool {
         self.lost
     }

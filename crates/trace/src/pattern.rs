@@ -61,10 +61,10 @@ pub fn periods(due_ns: &[u64], loop_period_ns: u64) -> Vec<Period> {
     };
     // Of two such periods, the longer one explains the other if it has nearly as many events.
     let explains = |long: &Period, short: &Period| 10 * long.same_phase >= 8 * short.same_phase;
-    let is_better = |other: &Period, period: &Period| {
-        is_multiple(other, period) && explains(other, period) || is_multiple(period, other) && !explains(period, other)
+    let is_better = |rival: &Period, period: &Period| {
+        is_multiple(rival, period) && explains(rival, period) || is_multiple(period, rival) && !explains(period, rival)
     };
-    found.iter().filter(|period| !found.iter().any(|other| is_better(other, period))).copied().collect()
+    found.iter().filter(|period| !found.iter().any(|rival| is_better(rival, period))).copied().collect()
 }
 
 /// Returns the first instants of late ticks that follow each other closely.

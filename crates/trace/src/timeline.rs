@@ -59,7 +59,7 @@ impl IdleCore {
     }
 }
 
-/// What runs on a core.
+/// A task or handler on a core.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Occupant {
     /// Nothing is known yet.

@@ -30,7 +30,7 @@ pub struct LateRecord {
     pub continued: bool,
     /// The thread.
     pub tid: u64,
-    /// The sender of the input that came last or was absent, as [`RoleId::number`](crate::runtime::RoleId::number); 0 if there is none.
+    /// The sender of the input that came last or was absent, as [`RoleId::number`](crate::runtime::RoleId::number); otherwise 0.
     pub sender: u64,
     /// The due time, ns.
     pub due_ns: u64,
