@@ -44,13 +44,13 @@ pub fn causes(delay: &Delay) -> Vec<Cause> {
     let (from_ns, began_ns) = (delay.own_from_ns(), delay.began_ns());
     let compute_ns = done_ns.saturating_sub(began_ns);
     let mut rest = Rest { wait_ns: began_ns - from_ns, compute_ns, causes: Vec::new() };
+    if stalled {
+        rest.explain(CauseKind::Fault, u64::MAX);
+    }
     rest.explain(CauseKind::Throttled, usage.throttled_ns);
     rest.explain(CauseKind::Task, usage.run_delay_ns.saturating_sub(usage.throttled_ns));
-    let all_ns = rest.wait_ns + rest.compute_ns;
-    match () {
-        () if stalled => rest.explain(CauseKind::Fault, all_ns),
-        () if continued => rest.explain(CauseKind::Stopped, all_ns),
-        () => {}
+    if continued {
+        rest.explain(CauseKind::Stopped, u64::MAX);
     }
     let faults_ns = usage.minor_faults.saturating_mul(FAULT_NS);
     if usage.major_faults > 0 || faults_ns > 0 && faults_ns >= rest.compute_ns / 2 {

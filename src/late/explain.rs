@@ -17,6 +17,9 @@ pub fn causes(delay: &Delay, sender: i32, window: &Window) -> Option<Vec<Cause>>
         return None;
     }
     let record = &delay.record;
+    if record.stalled {
+        return Some(vec![Cause::new(CauseKind::Fault, "", delay.ns() - delay.input_ns())]);
+    }
     let usage = &record.usage;
     let facts = Facts { throttled_ns: usage.throttled_ns, major_faults: usage.major_faults > 0 };
     let gap = (record.gap_end_ns.saturating_sub(record.gap_ns), record.gap_end_ns);
@@ -26,13 +29,7 @@ pub fn causes(delay: &Delay, sender: i32, window: &Window) -> Option<Vec<Cause>>
     let wait = Phase { from_ns, to_ns: began_ns, duty };
     let compute = Phase { from_ns: began_ns, to_ns: record.done_ns, duty: Duty::Compute };
     let phases = if delay.kind() == LateKind::Starved { &[][..] } else { &[wait, compute] };
-    let mut causes = window.blame(record.tid as i32, facts, phases);
-    if record.stalled {
-        let explained_us: f64 = causes.iter().map(|cause| cause.us).sum();
-        let rest_ns = delay.ns() - delay.input_ns() - ((explained_us * 1e3) as u64).min(delay.ns() - delay.input_ns());
-        causes.insert(0, Cause::new(CauseKind::Fault, "", rest_ns));
-    }
-    Some(causes)
+    Some(window.blame(record.tid as i32, facts, phases))
 }
 
 /// Returns what kept the sender of the last input, of which no late tick is known, from sending it.

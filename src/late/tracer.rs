@@ -43,6 +43,8 @@ const WINDOW_NS: u64 = 1_000_000_000;
 const TIMELINES: usize = 10;
 /// The number of late ticks, the longest delays first, that are explained at each look: beside more the trace would cost a core.
 const EXPLAINED: usize = 100;
+/// The number of events that are decoded at each look, about, for the same reason.
+const DECODED: u64 = 50_000;
 
 /// Findings of the process.
 #[derive(Debug, Default, Serialize, Deserialize)]
@@ -174,7 +176,12 @@ impl<'a> Tracer<'a> {
         // After the records: the trace then reaches beyond them.
         self.read_pages();
         late.sort_by_key(|(.., delay)| std::cmp::Reverse(delay.ns()));
-        late.into_iter().take(EXPLAINED).for_each(|(role, index, delay)| self.explain(role, index, &delay));
+        let (begun, late) = (self.events, late.into_iter().take(EXPLAINED));
+        for (role, index, delay) in late {
+            if self.events - begun < DECODED {
+                self.explain(role, index, &delay);
+            }
+        }
     }
 
     /// Watches the page faults of the roles' threads.

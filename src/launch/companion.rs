@@ -76,6 +76,11 @@ impl Companion {
         Some(cause)
     }
 
+    /// Returns true if there is or was a process.
+    pub fn is_started(&self) -> bool {
+        self.process.is_some()
+    }
+
     /// Asks the process to end.
     pub fn stop(&mut self) {
         let running = self.process.as_mut().and_then(|process| process.ended().is_none().then(|| process.pid()));

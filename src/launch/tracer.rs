@@ -53,7 +53,9 @@ impl TracerWatch {
     /// Returns the late ticks of the run with their causes. The process has ended, or is ended now.
     pub fn finish(self, scenario: &Scenario, domain: &Domain, reports: &[RoleReport]) -> Option<LateReport> {
         let found: Option<Findings> = findings(domain);
+        let lost = || self.companion.is_started().then(|| "the tracing process left no report".to_owned());
+        let note = self.note.or_else(|| if found.is_none() { lost() } else { None });
         drop(self.companion);
-        report(scenario, reports, found, self.note)
+        report(scenario, reports, found, note)
     }
 }

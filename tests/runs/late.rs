@@ -21,21 +21,44 @@ static TURN: Mutex<()> = Mutex::new(());
 /// Times of disturbances, ns.
 type Times = Vec<(u64, u64)>;
 
-/// Runs a scenario in real time while `disturb` runs beside it, given the run, until the flag is set. Returns the late ticks.
+/// Runs a scenario in real time while `disturb` runs beside it, until the flag is set. Returns the late ticks.
 fn run_beside(
     bench: &Bench,
     trace: &str,
     options: &[&str],
     disturb: impl Fn(&Bench, &AtomicBool) -> Times + Sync,
 ) -> (LateReport, Times) {
-    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    run_command(bench, trace, options, with_tracefs(bench, &[]), disturb)
+}
+
+/// The same with a variable in the environment.
+#[cfg(feature = "hooks")]
+fn run_with(
+    bench: &Bench,
+    trace: &str,
+    options: &[&str],
+    variable: (&str, &str),
+    disturb: impl Fn(&Bench, &AtomicBool) -> Times + Sync,
+) -> (LateReport, Times) {
+    let mut command = with_tracefs(bench, &[]);
+    command.env(variable.0, variable.1);
+    run_command(bench, trace, options, command, disturb)
+}
+
+fn run_command(
+    bench: &Bench,
+    trace: &str,
+    options: &[&str],
+    mut command: Command,
+    disturb: impl Fn(&Bench, &AtomicBool) -> Times + Sync,
+) -> (LateReport, Times) {
+    let _turn = TURN.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
     let trace = format!("--set=realtime.trace=\"{trace}\"");
     let arguments =
-        ["run", "rigid-pair", "--clock=realtime", "--duration=8", "--out=out", "--set=accept={}", "--quiet", &trace];
+        ["run", "rigid-pair", "--clock=realtime", "--duration=8", "--out=out", "--set=accept={}", "--quiet"];
     let ended = AtomicBool::new(false);
     let (done, times) = std::thread::scope(|scope| {
-        let mut command = with_tracefs(bench);
-        let running = Running::new(command.args(arguments).args(options));
+        let running = Running::new(command.args(arguments).arg(trace).args(options));
         bench.await_ticks("controller");
         let culprit = scope.spawn(|| disturb(bench, &ended));
         let done = running.wait();
@@ -46,15 +69,22 @@ fn run_beside(
     (serde_json::from_slice(&std::fs::read(bench.path("out/late.json")).unwrap()).unwrap(), times)
 }
 
-/// Returns a command of the program, in a mount namespace with tracefs if the machine has not mounted it.
-fn with_tracefs(bench: &Bench) -> Command {
-    if has_tracefs() || !rustix::process::geteuid().is_root() {
-        return bench.command();
-    }
-    let mut command = bench.command_of(Path::new("unshare"));
+/// Returns a command of the program that another one, if given, starts; in a mount namespace with tracefs if the machine has not
+/// mounted it.
+fn with_tracefs(bench: &Bench, through: &[&str]) -> Command {
+    let program = bench.command().get_program().to_owned();
     let mount = "mount -t tracefs nodev /sys/kernel/tracing 2>/dev/null; exec \"$0\" \"$@\"";
-    command.args(["--mount", "sh", "-c", mount]).arg(bench.command().get_program());
-    command
+    let namespace = ["unshare", "--mount", "sh", "-c", mount];
+    let needs_mount = !has_tracefs() && rustix::process::geteuid().is_root();
+    let words: Vec<&str> = namespace.into_iter().filter(|_| needs_mount).chain(through.iter().copied()).collect();
+    match words.split_first() {
+        None => bench.command(),
+        Some((first, rest)) => {
+            let mut command = bench.command_of(Path::new(first));
+            command.args(rest).arg(program);
+            command
+        }
+    }
 }
 
 fn has_tracefs() -> bool {
@@ -231,4 +261,148 @@ fn a_stop_by_a_signal_is_named() {
     };
     let stopped = |kind, _: &str| kind == CauseKind::Stopped;
     assert_culprit("a stop by a signal as the cause of late ticks", &[], stop, [&stopped, &stopped]);
+}
+
+#[test]
+fn a_stalled_leader_is_blamed_for_the_late_ticks_of_its_readers() {
+    if !can_disturb("a late input as the cause of late ticks") {
+        return;
+    }
+    let bench = Bench::new();
+    let stall = "--set=fault=[{kind=\"stall\", role=\"leader\", from_tick=100, ticks=7800, every=97, stall_ms=2.0}]";
+    for (trace, part) in [("kernel", 0.95), ("counters", 0.8)] {
+        let (report, _) = run_beside(&bench, trace, &[stall, "--overwrite"], |_, _| Vec::new());
+        let stalled = |late: &&LateTick| late.role == "leader" && main_cause(late).0 == CauseKind::Fault;
+        let leader: Vec<&LateTick> = report.ticks.iter().filter(stalled).collect();
+        assert!(leader.len() >= PLANTED, "{trace}: {} stalls named", leader.len());
+        for role in ["observer", "controller"] {
+            // Ticks that only the leader delayed: the follower may be late at the same time.
+            let during = |late: &&LateTick| {
+                late.role == role && leader.iter().any(|stall| stall.tick == late.tick && stall.ticks == late.ticks)
+            };
+            let late: Vec<&LateTick> = report.ticks.iter().filter(during).collect();
+            assert_named(&late, part, |late| {
+                let roots = report.root_causes(late);
+                let largest = roots.iter().max_by(|a, b| a.us.total_cmp(&b.us));
+                main_cause(late).0 == CauseKind::Input && largest.is_some_and(|root| root.kind == CauseKind::Fault)
+            });
+        }
+    }
+}
+
+/// Asserts that of the disturbances by a failpoint, at every 50th tick of the controller, the right part is named.
+#[cfg(feature = "hooks")]
+#[track_caller]
+fn assert_failpoint(action: &str, kind: CauseKind, least_us: f64) {
+    const EVERY: u64 = 50;
+    if !can_disturb(action) {
+        return;
+    }
+    let bench = Bench::new();
+    for (trace, part) in [("kernel", 0.95), ("counters", 0.8)] {
+        let hook = format!("controller computing {EVERY} {action}");
+        let options = ["--overwrite", "--set=realtime.late_us=50"];
+        let (report, _) = run_with(&bench, trace, &options, ("COROTATE_HOOK", &hook), |_, _| Vec::new());
+        if trace == "kernel" && !has_kernel_trace(&report, action) {
+            continue;
+        }
+        let summary = bench.summary_in("out");
+        let executed = summary["books"]["roles"]["controller"]["executed"].as_u64().unwrap();
+        let planted = (executed / EVERY) as usize;
+        let named = |late: &&LateTick| {
+            let cause = late.causes.iter().find(|cause| cause.kind == kind);
+            late.role == "controller" && cause.is_some_and(|cause| cause.us >= least_us)
+        };
+        let late: Vec<&LateTick> = report.ticks.iter().filter(named).collect();
+        println!("{action}, {trace}: {} of {planted} named", late.len());
+        assert!(planted >= PLANTED && late.len() as f64 >= part * planted as f64, "{} of {planted}", late.len());
+        report.ticks.iter().for_each(assert_explained);
+    }
+}
+
+#[cfg(feature = "hooks")]
+#[test]
+fn a_long_step_is_named() {
+    assert_failpoint("BURN", CauseKind::Step, 200.0);
+}
+
+#[cfg(feature = "hooks")]
+#[test]
+fn page_faults_are_named() {
+    assert_failpoint("FAULT", CauseKind::PageFault, 20.0);
+}
+
+/// A cgroup with a limit of 20 ms of processor time in 100 ms.
+struct Quota(std::path::PathBuf);
+
+impl Quota {
+    /// Creates the group; `None` if the machine has no cgroup with such limits, or this user must not create one.
+    fn create() -> Option<Self> {
+        let name = format!("corotate-test-{}", std::process::id());
+        let (old, unified) = (Path::new("/sys/fs/cgroup/cpu").join(&name), Path::new("/sys/fs/cgroup").join(&name));
+        if std::fs::create_dir(&old).is_ok() {
+            let group = Self(old);
+            let set = |file: &str, text: &str| std::fs::write(group.0.join(file), text).is_ok();
+            return (set("cpu.cfs_period_us", "100000") && set("cpu.cfs_quota_us", "20000")).then_some(group);
+        }
+        std::fs::create_dir(&unified).ok()?;
+        let group = Self(unified);
+        std::fs::write(group.0.join("cpu.max"), "20000 100000").is_ok().then_some(group)
+    }
+}
+
+impl Drop for Quota {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir(&self.0);
+    }
+}
+
+#[test]
+fn a_processor_quota_is_named_with_its_period() {
+    let what = "a processor quota as the cause of late ticks";
+    if !can_disturb(what) {
+        return;
+    }
+    let Some(quota) = Quota::create() else { return skipped(what, "no cgroup with a limit can be created here") };
+    let bench = Bench::new();
+    for (trace, part) in [("kernel", 0.95), ("counters", 0.8)] {
+        let tasks = quota.0.join("cgroup.procs");
+        // Roles that spin all the time use up the quota.
+        let options =
+            ["--overwrite", "--set=realtime.priority=0", "--set=realtime.wake=\"spin\"", "--set=realtime.spin_us=250"];
+        let move_there = format!("echo $$ > {}; exec \"$0\" \"$@\"", tasks.display());
+        let (report, _) =
+            run_command(&bench, trace, &options, with_tracefs(&bench, &["sh", "-c", &move_there]), |_, _| Vec::new());
+        if trace == "kernel" && !has_kernel_trace(&report, what) {
+            continue;
+        }
+        // Ticks of a body that lacked most of a quota's pause.
+        let stopped = |late: &&LateTick| late.caused_by.is_none() && late.late_us > 30_000.0;
+        let late: Vec<&LateTick> = report.ticks.iter().filter(stopped).collect();
+        assert_named(&late, part, |late| main_cause(late).0 == CauseKind::Throttled);
+        let found = report.patterns.iter().any(|pattern| pattern.period_ms == 100.0);
+        assert!(found, "{:?}", report.patterns);
+    }
+}
+
+#[test]
+fn a_quiet_run_accuses_no_task_that_did_not_run() {
+    if !can_disturb("the accusations of a quiet run") {
+        return;
+    }
+    let bench = Bench::new();
+    let (report, _) = run_beside(&bench, "kernel", &[], |_, _| Vec::new());
+    report.ticks.iter().for_each(assert_explained);
+    assert!(report.causes.iter().all(|total| total.name != CULPRIT));
+    for late in report.ticks.iter().filter(|late| !late.slices.is_empty()) {
+        for cause in late.causes.iter().filter(|cause| cause.kind == CauseKind::Task && late.late_us < 10_000.0) {
+            let ran: f64 = late
+                .slices
+                .iter()
+                .filter(|slice| slice.name == cause.name)
+                .map(|slice| slice.to_us - slice.from_us)
+                .sum();
+            assert!(ran + 1.0 >= cause.us, "{cause} in {late:#?}");
+        }
+    }
 }

@@ -206,8 +206,9 @@ impl Blame<'_> {
 
     /// Blames who had the core for which a thread waited, unless the limit of a cgroup kept the thread from it.
     fn ready(&mut self, core: usize, from_ns: u64, to_ns: u64) {
-        if self.facts.throttled_ns >= to_ns - from_ns {
-            self.facts.throttled_ns -= to_ns - from_ns;
+        // The times do not cover each other exactly.
+        if self.facts.throttled_ns > (to_ns - from_ns) / 2 {
+            self.facts.throttled_ns = self.facts.throttled_ns.saturating_sub(to_ns - from_ns);
             return self.add_kind(CauseKind::Throttled, to_ns - from_ns);
         }
         let spans: Vec<Span> =

@@ -241,7 +241,7 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
                     sleep_until(now_ns + NAP_NS);
                 }
                 self.gap.pause();
-                if self.turn(node)? {
+                if self.turn_while_waiting(node)? {
                     return Ok(None);
                 }
             }
@@ -261,14 +261,24 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
         Ok(false)
     }
 
-    /// Publishes the heartbeat if it is due; returns true if the run is over.
+    /// Publishes the heartbeat if it is due; returns true if the run is over. Not while a tick waits for its input.
     fn turn(&mut self, node: &mut dyn Node) -> Result<bool, NodeError> {
-        if !self.turn_is_due() {
-            return Ok(false);
+        if self.turn_is_due() {
+            self.late.iter_mut().for_each(LateWatch::rebase);
+            return self.serve(node);
         }
+        Ok(false)
+    }
+
+    /// Publishes the heartbeat if it is due, while a tick waits for its input; returns true if the run is over.
+    fn turn_while_waiting(&mut self, node: &mut dyn Node) -> Result<bool, NodeError> {
+        if self.turn_is_due() { self.serve(node) } else { Ok(false) }
+    }
+
+    /// Publishes the heartbeat, and returns true if the run is over.
+    fn serve(&mut self, node: &mut dyn Node) -> Result<bool, NodeError> {
         self.launcher.announce(RoleState::Running, node)?;
         node.refresh()?;
-        self.late.iter_mut().for_each(LateWatch::rebase);
         Ok(self.launcher.stopped()?)
     }
 

@@ -17,6 +17,8 @@ pub struct LateWatch {
     /// The last reading of the counters, and its time, ns.
     baseline: Usage,
     since_ns: u64,
+    /// Part of the time for which the thread waits for its core without being late: for roles that share the core.
+    usual_delay: f64,
     roles: Vec<WatchedRole>,
 }
 
@@ -39,12 +41,17 @@ impl LateWatch {
             Some(WatchedRole { role: *role, log, missed: 0, executed: 0 })
         };
         let roles: Vec<WatchedRole> = ledgers.iter().map(watched).collect::<Option<_>>()?;
-        Some(Self { usage, baseline: Usage::default(), since_ns: 0, roles })
+        Some(Self { usage, baseline: Usage::default(), since_ns: 0, usual_delay: 0.0, roles })
     }
 
-    /// Reads the counters, to which the next late tick is compared.
+    /// Reads the counters, to which the next late tick is compared. Not while a tick is due: what delays it would be lost.
     pub fn rebase(&mut self) {
-        (self.baseline, self.since_ns) = (self.usage.read(), monotonic_ns());
+        let (usage, now_ns) = (self.usage.read(), monotonic_ns());
+        if self.since_ns > 0 && now_ns > self.since_ns {
+            let waited_ns = usage.since(&self.baseline).run_delay_ns as f64;
+            self.usual_delay = (waited_ns / (now_ns - self.since_ns) as f64).min(1.0);
+        }
+        (self.baseline, self.since_ns) = (usage, now_ns);
     }
 
     /// Enters the late ticks of a node since the last call.
@@ -69,11 +76,14 @@ impl LateWatch {
     fn enter(&mut self, index: usize, node: &dyn Node, grid: Grid, spin: LateRecord) {
         let Some(ticks) = node.late_ticks() else { return };
         let (usage, now_ns) = (self.usage.read(), monotonic_ns());
+        let mut used = usage.since(&self.baseline);
+        let usual_ns = self.usual_delay * now_ns.saturating_sub(self.since_ns) as f64;
+        used.run_delay_ns = used.run_delay_ns.saturating_sub(usual_ns as u64);
         let common = LateRecord {
             tid: self.usage.tid(),
             continued: take_continued(),
             stalled: ticks.last.stalled,
-            usage: usage.since(&self.baseline),
+            usage: used,
             since_ns: self.since_ns,
             ..spin
         };

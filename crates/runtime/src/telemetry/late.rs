@@ -56,7 +56,7 @@ pub struct LateRecord {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Usage {
-    /// Time for which it could run and waited for a core, ns.
+    /// Time for which it could run and waited for a core, ns; of a late tick, beyond what is usual.
     pub run_delay_ns: u64,
     /// Page faults without input or output.
     pub minor_faults: u64,

@@ -93,6 +93,8 @@ pub trait AnyChannel<E> {
     fn gather(&mut self, tick: u64) -> Result<bool, NodeError>;
     /// Returns the body's index while its measurement of this tick may still arrive.
     fn late(&self, tick: u64) -> Option<usize>;
+    /// Returns the body's index if its measurement of the current tick is missing.
+    fn absent(&self) -> Option<usize>;
     /// Returns the measurement of the current tick as words.
     fn words(&self) -> Option<&[u64]>;
     /// Passes over a tick without command.
@@ -160,6 +162,10 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     #[inline]
     fn late(&self, tick: u64) -> Option<usize> {
         (!self.measurement.knows(tick)).then_some(self.body)
+    }
+
+    fn absent(&self) -> Option<usize> {
+        (!self.ready).then_some(self.body)
     }
 
     fn words(&self) -> Option<&[u64]> {

@@ -251,7 +251,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         (self.stages.tick, self.stages.starved, self.stages.late) = (stamp.tick, starved, None);
         self.skip_to(stamp.tick);
         if starved {
-            let absent = self.channels.iter().find_map(|channel| channel.late(stamp.tick));
+            let absent = self.channels.iter().find_map(AnyChannel::absent);
             self.counters.starved(stamp.tick, absent.map_or(0, |body| RoleId::Plant(body).number()));
         }
         self.counters.executed();
