@@ -6,8 +6,9 @@ use super::delay::Delay;
 use super::{Cause, CauseKind, LateKind};
 use crate::telemetry::LateRecord;
 
-/// The least time of a page fault, ns. Faults that take at least half of a computation at this rate are its cause.
-const FAULT_NS: u64 = 250;
+/// The longest usual time of a page fault, ns: a virtual machine takes some 2 µs. Faults that could take a whole computation at this rate
+/// are its cause.
+const FAULT_NS: u64 = 4_000;
 /// Shortest gap in a spin that is blamed on its core, ns.
 const GAP_NS: u64 = 20_000;
 
@@ -53,7 +54,7 @@ pub fn causes(delay: &Delay) -> Vec<Cause> {
         rest.explain(CauseKind::Stopped, u64::MAX);
     }
     let faults_ns = usage.minor_faults.saturating_mul(FAULT_NS);
-    if usage.major_faults > 0 || faults_ns > 0 && faults_ns >= rest.compute_ns / 2 {
+    if usage.major_faults > 0 || faults_ns > 0 && faults_ns >= rest.compute_ns {
         let faults_ns = std::mem::take(&mut rest.compute_ns);
         rest.add(CauseKind::PageFault, faults_ns);
     }

@@ -23,7 +23,7 @@ pub fn causes(delay: &Delay, sender: i32, window: &Window) -> Option<Vec<Cause>>
     let usage = &record.usage;
     let facts = Facts { throttled_ns: usage.throttled_ns, major_faults: usage.major_faults > 0 };
     let gap = (record.gap_end_ns.saturating_sub(record.gap_ns), record.gap_end_ns);
-    let timed = record.slept && record.gap_end_ns == 0;
+    let timed = record.slept;
     let duty = if delay.sender().is_none() { Duty::Timer { gap } } else { Duty::Wake { sender, timed, gap } };
     let (from_ns, began_ns) = (delay.own_from_ns(), delay.began_ns());
     let wait = Phase { from_ns, to_ns: began_ns, duty };

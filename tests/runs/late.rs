@@ -121,29 +121,35 @@ fn become_culprit(core: usize, priority: &[&str]) {
     }
 }
 
-/// Calls `disturb` again and again after random pauses, and returns when.
-fn at_random_instants(ended: &AtomicBool, mut disturb: impl FnMut()) -> Times {
+/// Calls `disturb` again and again after random pauses; it enters when it disturbed.
+fn at_random_instants(ended: &AtomicBool, mut disturb: impl FnMut(&mut Times)) -> Times {
     let mut times = Vec::new();
     for pause in pauses() {
         std::thread::sleep(pause);
         if ended.load(Ordering::Relaxed) {
             break;
         }
-        let begun_ns = raw_ns();
-        disturb();
-        times.push((begun_ns, raw_ns()));
+        disturb(&mut times);
     }
     times
 }
 
-/// Computes on core 1 for `busy` at random instants.
+/// Computes on core 1 for `busy` at random instants. Times in which another task had its core are left out.
 fn hog(priority: &[&str], busy: Duration, ended: &AtomicBool) -> Times {
+    const PREEMPTED_NS: u64 = 20_000;
     become_culprit(1, priority);
-    at_random_instants(ended, || {
-        let end_ns = raw_ns() + busy.as_nanos() as u64;
-        while raw_ns() < end_ns {
-            std::hint::spin_loop();
+    at_random_instants(ended, |times| {
+        let (mut begun_ns, mut last_ns) = (raw_ns(), raw_ns());
+        let end_ns = begun_ns + busy.as_nanos() as u64;
+        while last_ns < end_ns {
+            let now_ns = raw_ns();
+            if now_ns - last_ns > PREEMPTED_NS {
+                times.push((begun_ns, last_ns));
+                begun_ns = now_ns;
+            }
+            last_ns = now_ns;
         }
+        times.push((begun_ns, last_ns));
     })
 }
 
@@ -253,10 +259,12 @@ fn an_ordinary_task_beside_unprivileged_roles_is_named() {
 fn a_stop_by_a_signal_is_named() {
     let stop = |bench: &Bench, ended: &AtomicBool| {
         let leader = bench.await_role("leader");
-        at_random_instants(ended, || {
+        at_random_instants(ended, |times| {
+            let begun_ns = raw_ns();
             send_signal(leader, libc::SIGSTOP);
             std::thread::sleep(Duration::from_millis(3));
             send_signal(leader, libc::SIGCONT);
+            times.push((begun_ns, raw_ns()));
         })
     };
     let stopped = |kind, _: &str| kind == CauseKind::Stopped;

@@ -150,7 +150,7 @@ pub struct Driver<'a, 'b, B: Bus> {
     late: Option<LateWatch>,
     /// The longest gap of the current tick's spin.
     gap: SpinGap,
-    /// True if the process slept until a time before the current tick.
+    /// True if the process slept until a time before the current tick, and was not seen awake before its inputs.
     slept: bool,
 }
 
@@ -227,7 +227,8 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
             self.gap.look(now_ns);
             let condition = if now_ns >= overdue_ns { RunCondition::Overdue } else { RunCondition::Arrived };
             match node.poll(condition)? {
-                Poll::Waiting => {}
+                // It is awake before its inputs are there.
+                Poll::Waiting => self.slept = false,
                 done => return Ok(Some(done)),
             }
             hooks::at(Failpoint::Waiting);

@@ -40,7 +40,7 @@ pub struct LateRecord {
     pub began_ns: u64,
     /// The time of the sample, ns; of a missed tick, the time at which the role noticed it.
     pub done_ns: u64,
-    /// True if the thread slept until a time shortly before the tick.
+    /// True if the thread slept until a time shortly before the tick, and was not seen awake before its inputs were there.
     pub slept: bool,
     /// The longest time between two looks at the clock while the role spun before the tick, ns.
     pub gap_ns: u64,
