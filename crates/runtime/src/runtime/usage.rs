@@ -123,7 +123,7 @@ mod tests {
         assert_eq!(throttled_ns("nr_periods 8\nnr_throttled 3\nthrottled_time 4711\n"), Some(4711));
         assert_eq!(throttled_ns("usage_usec 1\nnr_throttled 3\nthrottled_usec 47\n"), Some(47_000));
         for strange in
-            ["", "1", "1 x 2", "-1 -1 -1", "throttled_time", "throttled_usec 18446744073709551615", "\n\n \n"]
+            ["", "1", "1 x 2", "-1 -1 -1", "throttled_time", "throttled_usec 99999999999999999999", "\n\n \n"]
         {
             assert_eq!((run_delay_ns(strange), throttled_ns(strange)), (None, None), "{strange:?}");
         }
