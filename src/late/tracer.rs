@@ -41,10 +41,9 @@ const PAGES: usize = 8192;
 const WINDOW_NS: u64 = 1_000_000_000;
 /// The number of late ticks whose timelines are kept.
 const TIMELINES: usize = 10;
-/// The number of late ticks, the longest delays first, that are explained at each look: beside more the trace would cost a core.
-const EXPLAINED: usize = 100;
-/// The number of events that are decoded at each look, about, for the same reason.
+/// The number of events that are decoded at each look, about: more would cost a core. At the end it is larger.
 const DECODED: u64 = 50_000;
+const DECODED_LAST: u64 = 5_000_000;
 
 /// Findings of the process.
 #[derive(Debug, Default, Serialize, Deserialize)]
@@ -120,6 +119,8 @@ struct Tracer<'a> {
     instance: Instance,
     cores: Vec<(usize, VecDeque<Page>)>,
     roles: Vec<TracedRole>,
+    /// Late ticks that are not explained: role, index of the record, delay.
+    pending: Vec<(usize, usize, Delay)>,
     findings: Vec<Finding>,
     events: u64,
     overruns: u64,
@@ -128,8 +129,8 @@ struct Tracer<'a> {
 struct TracedRole {
     role: RoleId,
     log: LateLog,
-    /// The number of records that are explained.
-    explained: usize,
+    /// The number of records that were seen.
+    seen: usize,
     /// The threads, of all generations.
     threads: Vec<i32>,
 }
@@ -143,11 +144,11 @@ impl<'a> Tracer<'a> {
         let instance = Instance::create(&format!("{PREFIX}{pid}-{id}"), &numbers, &[])?;
         let roles = RoleId::all(scenario).into_iter().filter_map(|role| {
             let log = late_log(scenario, role, &open_ledger(domain, scenario, role).ok()?)?;
-            Some(TracedRole { role, log, explained: 0, threads: Vec::new() })
+            Some(TracedRole { role, log, seen: 0, threads: Vec::new() })
         });
         let cores = numbers.into_iter().map(|core| (core, VecDeque::new())).collect();
         let roles = roles.collect();
-        Ok(Self { scenario, instance, cores, roles, findings: Vec::new(), events: 0, overruns: 0 })
+        Ok(Self { scenario, instance, cores, roles, pending: Vec::new(), findings: Vec::new(), events: 0, overruns: 0 })
     }
 
     fn follow(mut self, domain: &Domain, terminated: &AtomicBool) -> Findings {
@@ -157,6 +158,7 @@ impl<'a> Tracer<'a> {
         }
         // The events around the last late tick.
         self.look();
+        self.explain_pending(DECODED_LAST);
         let used = clock_gettime(ClockId::ProcessCPUTime);
         let cpu_s = used.tv_sec as f64 + used.tv_nsec as f64 / 1e9;
         let cost = TracerCost { cpu_s, events: self.events, overruns: self.overruns };
@@ -165,23 +167,30 @@ impl<'a> Tracer<'a> {
 
     fn look(&mut self) {
         self.follow_threads();
-        let mut late = Vec::new();
         for (role, traced) in self.roles.iter_mut().enumerate() {
-            for record in traced.log.records(traced.explained) {
+            for record in traced.log.records(traced.seen) {
                 let delay = Delay { role: traced.role, record, period_ns: self.scenario.period_ns };
-                late.push((role, traced.explained, delay));
-                traced.explained += 1;
+                self.pending.push((role, traced.seen, delay));
+                traced.seen += 1;
             }
         }
         // After the records: the trace then reaches beyond them.
         self.read_pages();
-        late.sort_by_key(|(.., delay)| std::cmp::Reverse(delay.ns()));
-        let (begun, late) = (self.events, late.into_iter().take(EXPLAINED));
-        for (role, index, delay) in late {
-            if self.events - begun < DECODED {
-                self.explain(role, index, &delay);
-            }
+        self.explain_pending(DECODED);
+    }
+
+    /// Explains late ticks, the longest delays first, until about `events` events are decoded. The others wait as long as their pages are
+    /// kept.
+    fn explain_pending(&mut self, events: u64) {
+        let begun = self.events;
+        self.pending.sort_by_key(|(.., delay)| delay.ns());
+        while self.events - begun < events
+            && let Some((role, index, delay)) = self.pending.pop()
+        {
+            self.explain(role, index, &delay);
         }
+        let kept_ns = monotonic_ns().saturating_sub(KEPT_NS);
+        self.pending.retain(|(.., delay)| delay.record.due_ns > kept_ns);
     }
 
     /// Watches the page faults of the roles' threads.

@@ -616,8 +616,11 @@ impl<'a> Supervisor<'a> {
         // once no other host is missing.
         let begun_ns = monotonic_ns();
         let within = |limit_ns: u64| monotonic_ns() - begun_ns < limit_ns;
-        while (self.foxglove.lingers() || self.tracer.companion.lingers()) && within(END_LIMIT.as_nanos() as u64)
-            || (self.recorder.lingers() || self.relay.leads() && self.relay.companion.lingers()) && within(HUNG_NS)
+        while self.foxglove.lingers() && within(END_LIMIT.as_nanos() as u64)
+            || (self.recorder.lingers()
+                || self.tracer.companion.lingers()
+                || self.relay.leads() && self.relay.companion.lingers())
+                && within(HUNG_NS)
         {
             let _ = self.announce();
             self.pause(monotonic_ns() + LOOK_NS);

@@ -239,7 +239,7 @@ fn assert_culprit(
 fn a_task_of_higher_priority_is_named() {
     assert_culprit(
         "a task of higher priority as the cause of late ticks",
-        &["--set=realtime.cores=[1]"],
+        &["--set=realtime.cores=[1]", "--set=realtime.late_us=300"],
         |_, ended| hog(&["chrt", "-f", "-p", "95"], Duration::from_micros(800), ended),
         [&|kind, name| (kind, name) == (CauseKind::Task, CULPRIT), &|kind, _| kind == CauseKind::Task],
     );
@@ -249,7 +249,7 @@ fn a_task_of_higher_priority_is_named() {
 fn an_ordinary_task_beside_unprivileged_roles_is_named() {
     assert_culprit(
         "an ordinary task as the cause of late ticks",
-        &["--set=realtime.cores=[1]", "--set=realtime.priority=0"],
+        &["--set=realtime.cores=[1]", "--set=realtime.priority=0", "--set=realtime.late_us=300"],
         |_, ended| hog(&["renice", "-n", "-20", "-p"], Duration::from_millis(3), ended),
         [&|kind, name| (kind, name) == (CauseKind::Task, CULPRIT), &|kind, _| kind == CauseKind::Task],
     );

@@ -10,6 +10,9 @@ use crate::clock::{Grid, SpinGap, monotonic_ns};
 use crate::config::Settings;
 use crate::telemetry::{LateLog, LateRecord, Ledger, Usage};
 
+/// The part of the usual waiting that is remembered at each heartbeat with less of it.
+const FORGET: f64 = 0.9;
+
 /// The late ticks of the roles of one process.
 #[derive(Debug)]
 pub struct LateWatch {
@@ -49,7 +52,8 @@ impl LateWatch {
         let (usage, now_ns) = (self.usage.read(), monotonic_ns());
         if self.since_ns > 0 && now_ns > self.since_ns {
             let waited_ns = usage.since(&self.baseline).run_delay_ns as f64;
-            self.usual_delay = (waited_ns / (now_ns - self.since_ns) as f64).min(1.0);
+            let part = waited_ns / (now_ns - self.since_ns) as f64;
+            self.usual_delay = part.max(FORGET * self.usual_delay).min(1.0);
         }
         (self.baseline, self.since_ns) = (usage, now_ns);
     }

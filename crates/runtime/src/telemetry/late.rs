@@ -8,8 +8,9 @@ use crate::state::{Persist, StoredWords, Words, persist_fields};
 use serde::{Deserialize, Serialize};
 use std::sync::atomic::{Ordering, fence};
 
-/// The number of records that a role keeps. Further late ticks are only counted.
-const CAPACITY: usize = 2048;
+/// The number of records that all roles of a run keep together, and bounds on that of one. Further late ticks are only counted.
+const RUN_CAPACITY: usize = 16_384;
+const CAPACITY: std::ops::RangeInclusive<usize> = 256..=4096;
 /// The word with the thread, and the first one of the records; the word before them counts the records.
 const THREAD: usize = 1;
 const FIRST: usize = 2;
@@ -105,17 +106,22 @@ pub struct LateTicks {
 #[derive(Debug)]
 pub struct LateLog {
     slots: Slots,
+    capacity: usize,
 }
 
 impl LateLog {
-    /// Returns the number of ledger words.
-    pub fn words() -> usize {
-        FIRST + CAPACITY * RECORD_WORDS
+    fn capacity(roles: usize) -> usize {
+        (RUN_CAPACITY / roles.max(1)).clamp(*CAPACITY.start(), *CAPACITY.end())
     }
 
-    /// Opens the records; `ledger` has given all parts before them.
-    pub fn open(ledger: &Ledger) -> Self {
-        Self { slots: ledger.take(Self::words()) }
+    /// Returns the number of ledger words in a run of this number of roles.
+    pub fn words(roles: usize) -> usize {
+        FIRST + Self::capacity(roles) * RECORD_WORDS
+    }
+
+    /// Opens the records in a run of this number of roles; `ledger` has given all parts before them.
+    pub fn open(ledger: &Ledger, roles: usize) -> Self {
+        Self { slots: ledger.take(Self::words(roles)), capacity: Self::capacity(roles) }
     }
 
     /// Announces the thread whose late ticks follow.
@@ -128,7 +134,7 @@ impl LateLog {
         self.slots.get(THREAD)
     }
 
-    /// Returns the number of late ticks that were entered; of these the first 2048 are kept.
+    /// Returns the number of late ticks that were entered; the first ones are kept.
     pub fn entered(&self) -> u64 {
         let entered = self.slots.get(0);
         fence(Ordering::Acquire);
@@ -138,7 +144,7 @@ impl LateLog {
     /// Enters a late tick.
     pub fn push(&self, mut record: LateRecord) {
         let entered = self.slots.get(0);
-        if (entered as usize) < CAPACITY {
+        if (entered as usize) < self.capacity {
             let mut at = SlotWords { slots: &self.slots, at: FIRST + entered as usize * RECORD_WORDS };
             record.persist(&mut at);
             fence(Ordering::Release);
@@ -148,7 +154,7 @@ impl LateLog {
 
     /// Returns the kept records from the one with this index on.
     pub fn records(&self, from: usize) -> impl Iterator<Item = LateRecord> {
-        let end = (self.entered() as usize).min(CAPACITY);
+        let end = (self.entered() as usize).min(self.capacity);
         (from..end).map(|index| {
             let first = FIRST + index * RECORD_WORDS;
             let words: Vec<u64> = (first..first + RECORD_WORDS).map(|word| self.slots.get(word)).collect();
@@ -181,9 +187,12 @@ mod tests {
 
     #[test]
     fn the_first_records_are_kept_and_all_are_counted() {
+        const ROLES: usize = 10;
         assert_eq!(length(&mut LateRecord::default()), RECORD_WORDS);
-        let ledger = Ledger::private(LateLog::words());
-        let (log, reader) = (LateLog::open(&ledger), LateLog::open(&ledger.reopened()));
+        let capacity = LateLog::capacity(ROLES);
+        assert_eq!([0, 1, 4, 10, 1000].map(LateLog::capacity), [4096, 4096, 4096, 1638, 256]);
+        let ledger = Ledger::private(LateLog::words(ROLES));
+        let (log, reader) = (LateLog::open(&ledger, ROLES), LateLog::open(&ledger.reopened(), ROLES));
         assert_eq!((reader.entered(), reader.records(0).count()), (0, 0));
         let record = |tick: u64| LateRecord {
             tick,
@@ -193,9 +202,9 @@ mod tests {
             since_ns: u64::MAX,
             ..LateRecord::default()
         };
-        (0..CAPACITY as u64 + 3).for_each(|tick| log.push(record(tick)));
-        assert_eq!(reader.entered(), CAPACITY as u64 + 3);
+        (0..capacity as u64 + 3).for_each(|tick| log.push(record(tick)));
+        assert_eq!(reader.entered(), capacity as u64 + 3);
         let kept: Vec<LateRecord> = reader.records(5).collect();
-        assert_eq!((kept.len(), kept[0], kept[CAPACITY - 6]), (CAPACITY - 5, record(5), record(CAPACITY as u64 - 1)));
+        assert_eq!((kept.len(), kept[0], kept[capacity - 6]), (capacity - 5, record(5), record(capacity as u64 - 1)));
     }
 }

@@ -123,7 +123,7 @@ pub fn accepted_ticks(scenario: &Settings, grid: Option<Grid>) -> AcceptedTicks 
 
 /// Returns the number of words in a role's ledger besides its record.
 pub fn ledger_words(scenario: &Settings, role: RoleId) -> usize {
-    let late = if scenario.keeps_late_ticks() { LateLog::words() } else { 0 };
+    let late = if scenario.keeps_late_ticks() { LateLog::words(scenario.roles().len()) } else { 0 };
     words_of(&ports(scenario, role).writes, extent(scenario)) + late
 }
 
@@ -131,7 +131,7 @@ pub fn ledger_words(scenario: &Settings, role: RoleId) -> usize {
 pub fn late_log(scenario: &Settings, role: RoleId, ledger: &Ledger) -> Option<LateLog> {
     let ledger = ledger.reopened();
     ledger.take(words_of(&ports(scenario, role).writes, extent(scenario)));
-    scenario.keeps_late_ticks().then(|| LateLog::open(&ledger))
+    scenario.keeps_late_ticks().then(|| LateLog::open(&ledger, scenario.roles().len()))
 }
 
 pub(super) fn words_of(written: &[Port], extent: Extent) -> usize {
