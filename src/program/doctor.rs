@@ -5,8 +5,10 @@ use super::output::{CommandResult, Exit, Failure, fail, say};
 use super::scenario::{Change, load};
 use super::signals::catch_signals;
 use crate::bus::domain::{DomainError, domains, remove_dead_domains, scan_abandoned};
-use crate::doctor::{Check, Demand, Diagnosis, Machine, Trial, Verdict, left_in_shared_memory, leftovers, refused};
+use crate::doctor::{Check, Demand, Diagnosis, Machine, Trial, Verdict};
+use crate::doctor::{kernel_trace, left_in_shared_memory, leftovers, refused};
 use crate::hosts::Address;
+use crate::late::remove_dead_traces;
 use crate::launch::{Launch, Progress, run};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
@@ -64,9 +66,11 @@ pub fn doctor(arguments: &Arguments) -> CommandResult {
     if !checks.iter().any(|check| check.name == "rtprio limit" && check.verdict == Verdict::Bad) {
         checks.extend(refused(demand.priority));
     }
+    checks.push(kernel_trace());
     checks.push(leftovers(cleared.and_then(|_| domains())));
     if arguments.clean {
         scan_abandoned(true);
+        remove_dead_traces();
     }
     checks.extend(left_in_shared_memory(scan_abandoned(false)));
     let trial = match (arguments.seconds > 0).then(|| attempt(arguments)).transpose() {

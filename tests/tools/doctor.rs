@@ -35,10 +35,12 @@ fn the_exit_code_is_the_worst_verdict() {
         "isolated cores",
         "cores",
         "processor quota",
+        "cpuset",
         "hardware threads",
         "device interrupts",
         "clock source",
         "/dev/shm",
+        "kernel trace",
         "leftover domains",
         "ticks",
     ] {
