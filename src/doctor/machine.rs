@@ -4,7 +4,7 @@
 
 use super::Check;
 use crate::config::{Cores, Realtime};
-use crate::runtime::{CpuQuota, RoleId, cpu_quota, shared_memory_bytes};
+use crate::runtime::{RoleId, shared_memory_bytes};
 use crate::scenario::Scenario;
 use rustix::fs::statvfs;
 use std::fs::OpenOptions;
@@ -60,7 +60,7 @@ impl Demand {
 /// A machine, represented by its files.
 #[derive(Debug, Clone)]
 pub struct Machine {
-    root: PathBuf,
+    pub(super) root: PathBuf,
 }
 
 impl Machine {
@@ -80,8 +80,9 @@ impl Machine {
             self.idle(),
             self.governor(),
             self.isolation(),
-            cores(demand),
+            Self::core_count(demand),
             self.quota(demand),
+            self.cpu_set(demand),
             self.siblings(demand),
             self.interrupts(demand),
             self.load(demand.cores),
@@ -123,7 +124,7 @@ impl Machine {
     }
 
     /// Returns a file's text without surrounding blanks; `None` if it is empty, missing or unreadable.
-    fn read(&self, path: &str) -> Option<String> {
+    pub(super) fn read(&self, path: &str) -> Option<String> {
         let bytes = std::fs::read(self.root.join(path)).ok()?;
         Some(String::from_utf8_lossy(&bytes).trim().to_owned()).filter(|text| !text.is_empty())
     }
@@ -249,86 +250,6 @@ impl Machine {
         }
     }
 
-    fn isolation(&self) -> Check {
-        let name = "isolated cores";
-        match self.read("sys/devices/system/cpu/isolated") {
-            Some(cores) => Check::ok(name, format!("{cores}: name them in realtime.cores")),
-            None => {
-                Check::warn(name, "none", "boot with isolcpus= and nohz_full=, and name these cores in realtime.cores")
-            }
-        }
-    }
-
-    /// The kernel does not apply a quota to tasks with SCHED_FIFO, but launcher and recorder have none.
-    fn quota(&self, demand: &Demand) -> Check {
-        let name = "processor quota";
-        let Some(CpuQuota { file, quota_us, period_us }) = cpu_quota(&self.root) else {
-            return Check::ok(name, "none found");
-        };
-        let found = format!("{quota_us} us of processor time in every {period_us} us");
-        if quota_us >= period_us.saturating_mul(demand.cores as u64) {
-            return Check::ok(name, format!("{found}: as much as the cores have"));
-        }
-        let found = format!("{found}: once it is used, processes without SCHED_FIFO stop until the next period");
-        let unlimited = if file.ends_with("cpu.max") { "max" } else { "-1" };
-        let remedy = format!("`echo {unlimited} > {}`, or start from another cgroup", file.display());
-        if demand.priority > 0 { Check::warn(name, found, remedy) } else { Check::bad(name, found, remedy) }
-    }
-
-    /// Returns the cores that the roles may use: those of the scenario, or those that this process may use.
-    fn cores_of_roles(&self, demand: &Demand) -> Vec<usize> {
-        let status = self.read("proc/self/status").unwrap_or_default();
-        let allowed = status.lines().find_map(|line| line.strip_prefix("Cpus_allowed_list:")).unwrap_or_default();
-        if demand.named_cores.is_empty() { core_list(allowed) } else { demand.named_cores.clone() }
-    }
-
-    fn siblings(&self, demand: &Demand) -> Check {
-        let name = "hardware threads";
-        let used = self.cores_of_roles(demand);
-        let siblings = |core: &usize| {
-            let path = format!("sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list");
-            self.read(&path).map(|list| (*core, core_list(&list)))
-        };
-        let known: Vec<(usize, Vec<usize>)> = used.iter().filter_map(siblings).collect();
-        let shared = |(core, siblings): &(usize, Vec<usize>)| {
-            siblings.iter().find(|sibling| *sibling > core && used.contains(sibling)).map(|sibling| (*core, *sibling))
-        };
-        match known.iter().find_map(shared) {
-            None if known.len() < used.len() || used.is_empty() => Check::ok(name, "unknown"),
-            None => Check::ok(name, "one per core, of those that roles use"),
-            Some((core, sibling)) => Check::warn(
-                name,
-                format!("{core} and {sibling} share a core: a role on one slows a role on the other"),
-                "name one thread per core in realtime.cores, or `echo off > /sys/devices/system/cpu/smt/control`",
-            ),
-        }
-    }
-
-    /// Checks if the cores that the scenario names handle interrupts of devices. Without named cores the roles use all, and no
-    /// interrupt can be kept away.
-    fn interrupts(&self, demand: &Demand) -> Check {
-        let name = "device interrupts";
-        let Ok(numbers) = std::fs::read_dir(self.root.join("proc/irq")) else { return Check::ok(name, "unknown") };
-        let numbers = numbers.flatten().filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
-        let cores = |number: &u32| {
-            let path = |file: &str| format!("proc/irq/{number}/{file}");
-            let text = self.read(&path("effective_affinity_list")).or_else(|| self.read(&path("smp_affinity_list")));
-            core_list(&text.unwrap_or_default())
-        };
-        let mut met: Vec<u32> =
-            numbers.filter(|number| cores(number).iter().any(|core| demand.named_cores.contains(core))).collect();
-        met.sort_unstable();
-        match (demand.named_cores.is_empty(), met.first()) {
-            (true, _) => Check::ok(name, "on all cores: realtime.cores names none for the roles"),
-            (false, None) => Check::ok(name, "none on the cores of the roles"),
-            (false, Some(first)) => Check::warn(
-                name,
-                format!("{} may come on the cores of the roles, such as {first}, and delay them", met.len()),
-                format!("write other cores to /proc/irq/{first}/smp_affinity_list, and likewise for the others"),
-            ),
-        }
-    }
-
     fn load(&self, cores: usize) -> Check {
         let name = "load";
         let average = self.read("proc/loadavg").and_then(|text| text.split_whitespace().next()?.parse::<f64>().ok());
@@ -376,32 +297,15 @@ impl Machine {
     }
 }
 
-/// Reads a list of cores, such as `0-2,5`; a malformed part is left out.
-fn core_list(text: &str) -> Vec<usize> {
-    let part = |part: &str| {
-        let (first, last) = part.split_once('-').unwrap_or((part, part));
-        // No machine has more cores.
-        let [first, last] = [first.trim().parse().ok()?, last.trim().parse::<usize>().ok()?.min(8192)];
-        Some(first..=last)
-    };
-    text.split(',').filter_map(part).flatten().collect()
-}
-
-fn cores(demand: &Demand) -> Check {
-    let (name, found) = ("cores", format!("{} for {} roles", demand.cores, demand.roles));
-    let remedy = "roles that share a core wait for each other: give the run more cores, or lower tick_hz";
-    if demand.cores >= demand.roles { Check::ok(name, found) } else { Check::warn(name, found, remedy) }
-}
-
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::super::Verdict;
     use super::*;
 
-    const DEMAND: Demand = Demand { roles: 4, cores: 4, named_cores: Vec::new(), priority: 80, shared_memory: 1 };
+    pub const DEMAND: Demand = Demand { roles: 4, cores: 4, named_cores: Vec::new(), priority: 80, shared_memory: 1 };
 
     /// Creates a machine of these files.
-    fn machine(files: &[(&str, &str)]) -> (tempfile::TempDir, Machine) {
+    pub fn machine(files: &[(&str, &str)]) -> (tempfile::TempDir, Machine) {
         let root = tempfile::tempdir().unwrap();
         for (path, text) in files {
             let path = root.path().join(path);
@@ -517,6 +421,7 @@ mod tests {
             ("sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "performance\n"),
             ("sys/devices/system/cpu/cpu3/cpufreq/scaling_governor", "performance\n"),
             ("sys/devices/system/cpu/isolated", "2-3\n"),
+            ("sys/devices/system/cpu/nohz_full", "1-3\n"),
             ("sys/devices/system/clocksource/clocksource0/current_clocksource", "tsc\n"),
         ]);
         let checks = machine.examine(&DEMAND);
@@ -544,42 +449,5 @@ mod tests {
         for name in ["virtual machine", "load", "cores", "cpufreq governor", "isolated cores"] {
             assert_eq!(verdict(name), Verdict::Warn, "{name}");
         }
-    }
-
-    #[test]
-    fn threads_of_one_core_and_interrupts_on_named_cores_are_reported() {
-        let (_root, machine) = machine(&[
-            ("proc/self/status", "Cpus_allowed_list:\t0-1,4\n"),
-            ("sys/devices/system/cpu/cpu0/topology/thread_siblings_list", "0,4\n"),
-            ("sys/devices/system/cpu/cpu1/topology/thread_siblings_list", "1\n"),
-            ("sys/devices/system/cpu/cpu4/topology/thread_siblings_list", "0,4\n"),
-            ("proc/irq/24/effective_affinity_list", "1\n"),
-            ("proc/irq/25/smp_affinity_list", "0-3\n"),
-            ("proc/irq/default_smp_affinity", "f\n"),
-            ("proc/irq/26/smp_affinity_list", "\u{1}-\n"),
-        ]);
-        let on = |named_cores: &[usize]| Demand { named_cores: named_cores.to_vec(), ..DEMAND };
-        let verdicts =
-            |named: &[usize]| [machine.siblings(&on(named)), machine.interrupts(&on(named))].map(|c| c.verdict);
-        assert_eq!(verdicts(&[]), [Verdict::Warn, Verdict::Ok]);
-        assert_eq!(verdicts(&[4]), [Verdict::Ok, Verdict::Ok]);
-        assert_eq!(verdicts(&[1, 2]), [Verdict::Ok, Verdict::Warn]);
-        assert!(machine.interrupts(&on(&[1])).found.starts_with("2 "));
-        let threads = |named: &[usize]| machine.siblings(&on(named)).found;
-        assert!(threads(&[0, 1]) != "unknown" && threads(&[1, 2]) == "unknown", "core 2 has no file");
-        assert_eq!(core_list("0-2,5,x,7-"), [0, 1, 2, 5]);
-        assert_eq!(core_list("0-18446744073709551615").len(), 8193);
-    }
-
-    /// The kernel applies a quota to tasks without SCHED_FIFO only, and one of all cores limits nothing.
-    #[test]
-    fn a_quota_is_bad_only_where_it_stops_the_roles() {
-        let (_root, machine) = machine(&[
-            ("proc/self/cgroup", "0::/a\n"),
-            ("proc/self/mountinfo", "40 31 0:40 / /sys/fs/cgroup rw - cgroup2 cgroup2 rw\n"),
-            ("sys/fs/cgroup/a/cpu.max", "200000 100000\n"),
-        ]);
-        let verdict = |priority, cores| machine.quota(&Demand { priority, cores, ..DEMAND }).verdict;
-        assert_eq!([verdict(80, 4), verdict(0, 4), verdict(0, 2)], [Verdict::Warn, Verdict::Bad, Verdict::Ok]);
     }
 }

@@ -3,19 +3,31 @@
 //! | file | duty |
 //! |---|---|
 //! | `machine` | reads /proc, /sys and /dev below a root, and judges each value |
+//! | `cores` | the same for the cores of the roles |
 //! | `trial` | judges the roles' reports of a few seconds in real time |
+//! | `hunt` | measures the lateness of wakes on each core, and finds the causes of late ones |
+//! | `probe` | the thread on a core that wakes |
+//! | `hunt_report` | options and result of a hunt |
 //!
-//! Must not change the machine, nor start the run, and must not fail: a value that the system does not provide is unknown.
+//! Must not change the machine, apart from the trace instance of a hunt, nor start the run, and must not fail: a value that the
+//! system does not provide is unknown.
 
+mod cores;
+mod hunt;
+mod hunt_report;
 mod machine;
+mod probe;
 mod trial;
 
+pub use hunt::hunt;
+pub use hunt_report::{CoreLateness, HuntOptions, HuntReport};
 pub use machine::{Demand, Machine};
 pub use trial::Trial;
 
 use crate::bus::domain::{AbandonedFiles, DomainError, FoundDomain};
 use crate::runtime::{priority_remedy, refused_priority};
 use crate::telemetry::MachineInfo;
+use corotate_trace::{TraceError, require_tracefs};
 use serde::Serialize;
 use std::fmt;
 use std::path::Path;
@@ -152,6 +164,20 @@ pub fn leftovers(domains: Result<Vec<FoundDomain>, DomainError>) -> Check {
     }
 }
 
+/// Returns the line on the kernel's trace, from which the causes of late ticks are named.
+pub fn kernel_trace() -> Check {
+    judge_trace(require_tracefs())
+}
+
+fn judge_trace(available: Result<(), TraceError>) -> Check {
+    let name = "kernel trace";
+    let Err(error) = available else { return Check::ok(name, "available: causes of late ticks get their names") };
+    let text = error.to_string();
+    let text = text.strip_prefix("no kernel trace: ").unwrap_or(&text);
+    let (problem, remedy) = text.split_once("; ").unwrap_or((text, "run as root"));
+    Check::warn(name, format!("{problem}: causes of late ticks have no names"), remedy)
+}
+
 /// Returns the line on leftovers of dead runs in shared memory; `None` without leftovers.
 pub fn left_in_shared_memory(left: AbandonedFiles) -> Option<Check> {
     let AbandonedFiles { runs, files, bytes } = left;
@@ -188,6 +214,17 @@ mod tests {
         let json: serde_json::Value = serde_json::from_str(&unfit.to_json()).unwrap();
         assert_eq!((json["fit"].as_bool(), json["checks"][2]["verdict"].as_str()), (Some(false), Some("bad")));
         assert_eq!(json["checks"][1]["remedy"], "mend b");
+    }
+
+    #[test]
+    fn a_missing_trace_is_a_warning_with_the_remedy() {
+        assert_eq!(judge_trace(Ok(())).verdict, Verdict::Ok);
+        let check = judge_trace(Err(TraceError::NotMounted));
+        assert!(check.verdict == Verdict::Warn && check.found.starts_with("tracefs is not mounted"), "{check:?}");
+        assert!(check.remedy.unwrap().starts_with("as root, run `mount"));
+        let source = std::io::ErrorKind::PermissionDenied.into();
+        let check = judge_trace(Err(TraceError::NotPermitted { path: "/sys/kernel/tracing/instances".into(), source }));
+        assert!(check.found.contains("/instances") && check.remedy.unwrap().contains("chown"));
     }
 
     #[test]

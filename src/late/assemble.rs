@@ -67,8 +67,7 @@ pub fn report(
         patterns: Vec::new(),
         tracer: cost,
     };
-    report.causes = totals(&report);
-    report.patterns = patterns(&report);
+    report.summarize();
     Some(report)
 }
 
@@ -120,13 +119,8 @@ fn link(mut ticks: Vec<(LateTick, Vec<Cause>)>, delay_ticks: u64) -> Vec<LateTic
         if by.is_none() {
             replace_input(&mut late.causes, std::mem::take(input_causes));
         }
-        late.causes.retain(|cause| cause.us >= LEAST_PART * late.late_us);
+        late.complete_causes();
         late.caused_by = by.filter(|_| late.causes.iter().any(|cause| cause.kind == CauseKind::Input));
-        let unknown_us = late.unexplained_us();
-        if unknown_us > LEAST_UNKNOWN * late.late_us {
-            late.causes.push(Cause { us: unknown_us, ..Cause::new(CauseKind::Unknown, "", 0) });
-        }
-        late.causes.sort_by(|a, b| b.us.total_cmp(&a.us));
     }
     ticks.into_iter().map(|(late, _)| late).collect()
 }
@@ -143,7 +137,24 @@ fn replace_input(causes: &mut Vec<Cause>, kept: Vec<Cause>) {
     }
 }
 
+impl LateTick {
+    /// Drops small causes, adds what no cause explains as unknown, and sorts the causes by their parts.
+    pub(crate) fn complete_causes(&mut self) {
+        self.causes.retain(|cause| cause.us >= LEAST_PART * self.late_us);
+        let unknown_us = self.unexplained_us();
+        if unknown_us > LEAST_UNKNOWN * self.late_us {
+            self.causes.push(Cause { us: unknown_us, ..Cause::new(CauseKind::Unknown, "", 0) });
+        }
+        self.causes.sort_by(|a, b| b.us.total_cmp(&a.us));
+    }
+}
+
 impl LateReport {
+    /// Computes the totals by cause and the periods with which late ticks repeat.
+    pub(crate) fn summarize(&mut self) {
+        (self.causes, self.patterns) = (totals(self), patterns(self));
+    }
+
     /// Returns the causes of a late tick, with late inputs replaced by the causes of their senders' late ticks.
     pub fn root_causes(&self, late: &LateTick) -> Vec<Cause> {
         self.roots(late, CHAIN)

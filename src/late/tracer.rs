@@ -5,6 +5,7 @@
 
 use super::delay::Delay;
 use super::explain::{causes, input_causes, slices};
+use super::ring::{KEPT_NS, TraceRing};
 use super::{Cause, Slice, TracerCost};
 use crate::bus::domain::Domain;
 use crate::clock::{monotonic_ns, sleep_until};
@@ -13,32 +14,15 @@ use crate::scenario::Scenario;
 use crate::seat::{RoleError, join_complete, open_ledger, report_path, write_whole};
 use crate::system::name_thread;
 use crate::telemetry::LateLog;
-use corotate_trace::{Event, Instance, Page, TraceError, Window, remove_instances};
-use rustix::thread::sched_getaffinity;
-use rustix::time::{ClockId, clock_gettime};
+use corotate_trace::TraceError;
 use serde::{Deserialize, Serialize};
-use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// The name of the process.
 pub const TRACER: &str = "tracer";
-/// The beginning of the names of all trace instances of this program.
-const PREFIX: &str = "corotate-";
 /// Interval between two looks at the trace and at the records of late ticks, ns.
 const POLL_NS: u64 = 20_000_000;
-/// Time before a late tick that is decoded: it must include a switch on each core, ns.
-const BEFORE_NS: u64 = 20_000_000;
-/// The same in periods of the loop.
-const BEFORE_PERIODS: u64 = 3;
-/// Time after a late tick that is decoded, ns.
-const AFTER_NS: u64 = 1_000_000;
-/// Age at which pages are dropped, ns.
-const KEPT_NS: u64 = 3_000_000_000;
-/// The largest number of pages that are kept of each core.
-const PAGES: usize = 8192;
-/// Longest delay whose whole time is decoded, ns; of a longer one its end.
-const WINDOW_NS: u64 = 1_000_000_000;
 /// The number of late ticks whose timelines are kept.
 const TIMELINES: usize = 10;
 /// The number of events that are decoded at each look, about: more would cost a core. At the end it is larger.
@@ -83,15 +67,6 @@ pub fn findings(domain: &Domain) -> Option<Findings> {
     serde_json::from_slice(&std::fs::read(report_path(domain.root(), TRACER)).ok()?).ok()
 }
 
-/// Removes the trace instances of dead processes of this program.
-pub fn remove_dead_traces() {
-    // The kernel keeps an instance that a process reads, even if this one cannot see the process.
-    remove_instances(PREFIX, |name| {
-        let pid = name.strip_prefix(PREFIX).and_then(|rest| rest.split('-').next()?.parse::<u32>().ok());
-        pid.is_none_or(|pid| Path::new(&format!("/proc/{pid}")).exists())
-    });
-}
-
 /// Traces a run until `terminated`, and writes what it found to the domain.
 ///
 /// # Errors
@@ -116,14 +91,11 @@ pub fn run_tracer(root: &Path, terminated: &AtomicBool) -> Result<(), RoleError>
 
 struct Tracer<'a> {
     scenario: &'a Scenario,
-    instance: Instance,
-    cores: Vec<(usize, VecDeque<Page>)>,
+    ring: TraceRing,
     roles: Vec<TracedRole>,
     /// Late ticks that are not explained: role, index of the record, delay.
     pending: Vec<(usize, usize, Delay)>,
     findings: Vec<Finding>,
-    events: u64,
-    overruns: u64,
 }
 
 struct TracedRole {
@@ -137,18 +109,14 @@ struct TracedRole {
 
 impl<'a> Tracer<'a> {
     fn start(domain: &Domain, scenario: &'a Scenario) -> Result<Self, TraceError> {
-        remove_dead_traces();
-        let set = sched_getaffinity(None).unwrap_or_default();
-        let numbers: Vec<usize> = (0..rustix::thread::CpuSet::MAX_CPU).filter(|core| set.is_set(*core)).collect();
-        let (pid, id) = (std::process::id(), domain.root().file_name().unwrap_or_default().to_string_lossy());
-        let instance = Instance::create(&format!("{PREFIX}{pid}-{id}"), &numbers, &[])?;
+        let id = domain.root().file_name().unwrap_or_default().to_string_lossy();
+        let ring = TraceRing::start(&id)?;
         let roles = RoleId::all(scenario).into_iter().filter_map(|role| {
             let log = late_log(scenario, role, &open_ledger(domain, scenario, role).ok()?)?;
             Some(TracedRole { role, log, seen: 0, threads: Vec::new() })
         });
-        let cores = numbers.into_iter().map(|core| (core, VecDeque::new())).collect();
         let roles = roles.collect();
-        Ok(Self { scenario, instance, cores, roles, pending: Vec::new(), findings: Vec::new(), events: 0, overruns: 0 })
+        Ok(Self { scenario, ring, roles, pending: Vec::new(), findings: Vec::new() })
     }
 
     fn follow(mut self, domain: &Domain, terminated: &AtomicBool) -> Findings {
@@ -159,10 +127,7 @@ impl<'a> Tracer<'a> {
         // The events around the last late tick.
         self.look();
         self.explain_pending(DECODED_LAST);
-        let used = clock_gettime(ClockId::ProcessCPUTime);
-        let cpu_s = used.tv_sec as f64 + used.tv_nsec as f64 / 1e9;
-        let cost = TracerCost { cpu_s, events: self.events, overruns: self.overruns };
-        Findings { note: None, ticks: self.findings, cost: Some(cost) }
+        Findings { note: None, ticks: self.findings, cost: Some(self.ring.cost()) }
     }
 
     fn look(&mut self) {
@@ -175,16 +140,16 @@ impl<'a> Tracer<'a> {
             }
         }
         // After the records: the trace then reaches beyond them.
-        self.read_pages();
+        self.ring.read();
         self.explain_pending(DECODED);
     }
 
     /// Explains late ticks, the longest delays first, until about `events` events are decoded. The others wait as long as their pages are
     /// kept.
     fn explain_pending(&mut self, events: u64) {
-        let begun = self.events;
+        let begun = self.ring.decoded();
         self.pending.sort_by_key(|(.., delay)| delay.ns());
-        while self.events - begun < events
+        while self.ring.decoded() - begun < events
             && let Some((role, index, delay)) = self.pending.pop()
         {
             self.explain(role, index, &delay);
@@ -205,32 +170,13 @@ impl<'a> Tracer<'a> {
         }
         if news {
             let threads: Vec<i32> = self.roles.iter().filter_map(|role| role.threads.last().copied()).collect();
-            // Without these events page faults count as computation.
-            let _ = self.instance.set_page_fault_threads(&threads);
-        }
-    }
-
-    fn read_pages(&mut self) {
-        let now_ns = monotonic_ns();
-        for (core, pages) in &mut self.cores {
-            let overruns = &mut self.overruns;
-            self.instance.read(*core, &mut |page| {
-                *overruns += u64::from(page.lost);
-                pages.push_back(page);
-            });
-            // A page begins before its last event: the next one must be old too.
-            while pages.len() > PAGES || pages.get(1).is_some_and(|next| next.start_ns + KEPT_NS < now_ns) {
-                pages.pop_front();
-            }
+            self.ring.set_page_fault_threads(&threads);
         }
     }
 
     fn explain(&mut self, role: usize, index: usize, delay: &Delay) {
         let (role, record) = (self.roles[role].role.number(), &delay.record);
-        let to_ns = record.done_ns + AFTER_NS;
-        let before_ns = BEFORE_NS.max(BEFORE_PERIODS * self.scenario.period_ns);
-        let from_ns = record.due_ns.saturating_sub(before_ns).max(to_ns.saturating_sub(WINDOW_NS));
-        let window = Window::new(self.decode(from_ns, to_ns), from_ns, to_ns);
+        let window = self.ring.around(record.due_ns, record.done_ns, self.scenario.period_ns);
         let thread_of = |role: RoleId| self.roles.iter().find(|traced| traced.role == role)?.threads.last().copied();
         let sender = delay.sender().and_then(thread_of).unwrap_or(0);
         let roles = &self.roles;
@@ -267,18 +213,5 @@ impl<'a> Tracer<'a> {
         {
             least.slices.clear();
         }
-    }
-
-    /// Decodes the events of a time on all cores.
-    fn decode(&mut self, from_ns: u64, to_ns: u64) -> Vec<Event> {
-        let mut events = Vec::new();
-        for (core, pages) in &self.cores {
-            let first = pages.partition_point(|page| page.start_ns <= from_ns).saturating_sub(1);
-            for page in pages.iter().skip(first).take_while(|page| page.start_ns < to_ns) {
-                self.instance.formats().decode(page, *core, &mut events);
-            }
-        }
-        self.events += events.len() as u64;
-        events
     }
 }

@@ -310,6 +310,25 @@ mod tests {
         assert_eq!(causes, [(CauseKind::Task, "hog".to_owned(), 700.0)]);
     }
 
+    /// A hog that a shell starts is called like the shell, with its priority, until it runs its own program.
+    #[test]
+    fn a_task_has_the_name_with_which_it_leaves_the_core() {
+        let early = Task { tid: HOG, name: "chrt".to_owned(), priority: 120 };
+        let events = vec![
+            switch(10, ROLE, TaskState::Sleeping, 0),
+            event(900, 0, EventKind::Switch { from: task(0), state: TaskState::Runnable, to: early }),
+            waking(1000, ROLE),
+            event(1100, 0, EventKind::VectorEntry { name: "local_timer" }),
+            event(1103, 0, EventKind::VectorExit),
+            switch(1700, HOG, TaskState::Runnable, ROLE),
+        ];
+        let window = Window::new(events, 0, 10_000 * US);
+        let phase = Phase { from_ns: 1000 * US, to_ns: 1700 * US, duty: timer_duty() };
+        let causes = window.blame(ROLE, Facts::default(), &[phase]);
+        let found: Vec<_> = causes.iter().map(|cause| (&*cause.name, cause.priority, cause.us)).collect();
+        assert_eq!(found, [("hog", Some(4), 697.0), ("local_timer", None, 3.0)]);
+    }
+
     #[test]
     fn interrupts_within_the_time_of_another_task_are_named_themselves() {
         let events = vec![

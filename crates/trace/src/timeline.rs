@@ -125,6 +125,8 @@ struct CoreBuilder {
     timeline: CoreTimeline,
     /// The task that the interrupts below interrupted.
     task: Option<Task>,
+    /// The index of the first span since that task got the core.
+    since: usize,
     interrupts: Vec<Occupant>,
     last_ns: Option<u64>,
     /// True once events are missing.
@@ -147,7 +149,9 @@ impl CoreBuilder {
                     let unknown = self.timeline.spans.iter_mut().filter(|span| span.occupant == Occupant::Unknown);
                     unknown.for_each(|span| span.occupant = occupant.clone());
                 }
+                self.rename(from);
                 self.task = Some(to.clone());
+                self.since = self.timeline.spans.len();
                 self.interrupts.clear();
             }
             EventKind::IrqEntry { name, .. } => self.interrupts.push(Occupant::Interrupt(name.clone())),
@@ -163,6 +167,15 @@ impl CoreBuilder {
                 self.interrupts.clear();
             }
             EventKind::Waking { .. } | EventKind::PageFault { .. } => {}
+        }
+    }
+
+    /// Gives the current task its name and priority at its end: it may have changed both since it got the core.
+    fn rename(&mut self, last: &Task) {
+        if self.task.as_ref().is_some_and(|task| task.tid == last.tid && task != last) {
+            let spans = self.timeline.spans[self.since..].iter_mut();
+            let own = spans.filter(|span| matches!(&span.occupant, Occupant::Task(task) if task.tid == last.tid));
+            own.for_each(|span| span.occupant = of_task(last));
         }
     }
 

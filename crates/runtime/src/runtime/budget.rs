@@ -1,5 +1,5 @@
-//! The limits of a cgroup: a real-time budget of zero, with which the kernel refuses SCHED_FIFO even to root, and a quota of
-//! processor time.
+//! The limits of a cgroup: a real-time budget of zero, with which the kernel refuses SCHED_FIFO even to root, a quota of
+//! processor time, and a set of cores.
 //!
 //! Must not change a limit.
 
@@ -59,6 +59,40 @@ pub fn cpu_quota(root: &Path) -> Option<CpuQuota> {
     limits.min_by(|a, b| {
         (u128::from(a.quota_us) * u128::from(b.period_us)).cmp(&(u128::from(b.quota_us) * u128::from(a.period_us)))
     })
+}
+
+/// The set of cores of a cgroup: its tasks run on no other core.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CpuSetLimit {
+    /// The file that sets it.
+    pub file: PathBuf,
+    /// The cores, as the kernel lists them, such as `0-2,5`.
+    pub cores: String,
+}
+
+/// Returns the set of cores of this process's cgroup (version 1 or 2), with the file of the outermost group that has the same set;
+/// `None` without such a controller.
+pub fn cpu_set(root: &Path) -> Option<CpuSetLimit> {
+    let read = |path: &Path| fs::read_to_string(root.join(path.strip_prefix("/").unwrap_or(path))).ok();
+    let [cgroups, mounts] =
+        ["/proc/self/cgroup", "/proc/self/mountinfo"].map(|path| read(Path::new(path)).unwrap_or_default());
+    let has_cpuset = |list: &str| list.split(',').any(|name| name == "cpuset");
+    let old = groups(&cgroups, &mounts, has_cpuset, |kind, options| kind == "cgroup" && has_cpuset(options));
+    let limits = |groups: Vec<PathBuf>, files: &[&str]| -> Vec<CpuSetLimit> {
+        let cores = |group: &Path| {
+            let texts = files.iter().filter_map(|file| read(&group.join(file)));
+            texts.map(|text| text.trim().to_owned()).find(|text| !text.is_empty())
+        };
+        let limit = |group: PathBuf| Some(CpuSetLimit { cores: cores(&group)?, file: group.join("cpuset.cpus") });
+        groups.into_iter().filter_map(limit).collect()
+    };
+    // Older kernels have no effective set in version 1.
+    let old = limits(old, &["cpuset.effective_cpus", "cpuset.cpus"]);
+    let unified = limits(unified_groups(&cgroups, &mounts), &["cpuset.cpus.effective"]);
+    // A kernel has the controller in one of the two versions.
+    let limits = if old.is_empty() { unified } else { old };
+    let own = limits.last()?.cores.clone();
+    limits.into_iter().find(|limit| limit.cores == own)
 }
 
 /// Returns the budget files of the cgroups of controller `cpu` (version 1), outermost first. Version 2 has no budgets.
@@ -147,6 +181,40 @@ mod tests {
         for (cgroups, mounts) in [("1:cpu:/", " - "), ("1:cpu:/", "a b c d e f - cgroup x"), ("::", "- - - -")] {
             let _ = find(cgroups, mounts);
         }
+    }
+
+    #[test]
+    fn the_group_that_limits_the_cores_is_found_in_both_versions() {
+        let set = |cgroups: &str, files: &[(&str, &str)]| {
+            let root = tempfile::tempdir().unwrap();
+            let mounts = format!("{MOUNTS}40 31 0:40 / /sys/fs/cgroup/unified rw - cgroup2 cgroup2 rw,nsdelegate\n");
+            for (path, text) in [("proc/self/cgroup", cgroups), ("proc/self/mountinfo", &*mounts)].iter().chain(files) {
+                let path = root.path().join(path);
+                fs::create_dir_all(path.parent().unwrap()).unwrap();
+                fs::write(path, text).unwrap();
+            }
+            cpu_set(root.path()).map(|found| (found.file.display().to_string(), found.cores))
+        };
+        let found = |file: &str, cores: &str| Some((format!("/sys/fs/cgroup/{file}"), cores.to_owned()));
+        let old = [
+            ("sys/fs/cgroup/cpuset/cpuset.effective_cpus", "0-3\n"),
+            ("sys/fs/cgroup/cpuset/a/cpuset.effective_cpus", "0-1\n"),
+            ("sys/fs/cgroup/cpuset/a/b/cpuset.effective_cpus", "0-1\n"),
+        ];
+        assert_eq!(set("5:cpuset:/a/b\n0::/\n", &old), found("cpuset/a/cpuset.cpus", "0-1"));
+        assert_eq!(set("5:cpuset:/\n0::/\n", &old), found("cpuset/cpuset.cpus", "0-3"));
+        let older = [("sys/fs/cgroup/cpuset/a/cpuset.cpus", "2\n")];
+        assert_eq!(set("5:cpuset:/a\n", &older), found("cpuset/a/cpuset.cpus", "2"));
+        let unified = [
+            ("sys/fs/cgroup/unified/cpuset.cpus.effective", "0-7\n"),
+            ("sys/fs/cgroup/unified/a/cpuset.cpus.effective", "4-5,7\n"),
+        ];
+        // Group b has no controller of its own.
+        assert_eq!(set("0::/a/b\n", &unified), found("unified/a/cpuset.cpus", "4-5,7"));
+        for strange in ["", "\n", "0::\n", "5:cpuset:/../a\n0::/../a\n"] {
+            assert_eq!(set(strange, &old), None, "{strange:?}");
+        }
+        assert_eq!(set("5:cpuset:/\n", &[("sys/fs/cgroup/cpuset/cpuset.cpus", "\n")]), None);
     }
 
     #[test]

@@ -21,7 +21,7 @@ mod role_impl;
 mod sample_source;
 mod usage;
 
-pub use budget::{CpuQuota, cpu_quota, empty_budgets, grant_budgets};
+pub use budget::{CpuQuota, CpuSetLimit, cpu_quota, cpu_set, empty_budgets, grant_budgets};
 pub use device::{DeviceConfig, DeviceLink};
 pub use disturb::{Disturbance, Interruptions, LateSamples};
 pub use drive::{Backoff, Driver, Ended, LauncherLink, drive_in_turn, drive_in_turn_tracked, run_in_turn};
@@ -42,12 +42,12 @@ pub use privileges::take_priority_above_roles;
 pub use privileges::{Privileges, hold_low_latency_idle, priority_remedy, refused_priority, unavailable_cores};
 pub use privileges::{
     join_at_low_priority, release_priority, request_short_slices, take_lowest_realtime_priority, take_privileges,
-    with_realtime_priority,
+    take_probe_privileges, usable_cores, with_realtime_priority,
 };
 pub use role_function::{RoleFunction, TickSamples};
 pub use role_id::RoleId;
 pub use role_impl::RoleImpl;
-pub use usage::watch_continued;
+pub use usage::{ThreadUsage, watch_continued};
 
 use crate::bus::Depths;
 use crate::config::{ClockKind, Settings};

@@ -60,8 +60,7 @@ pub fn take_privileges(scenario: &Settings, role: RoleId) -> Privileges {
         grants.push(grant("locked memory", "all".to_owned(), lock_memory(), remedy));
     }
     if settings.priority > 0 {
-        let remedy = priority_remedy(Path::new("/"));
-        grants.push(grant(FIFO, settings.priority.to_string(), set_fifo(settings.priority), &remedy));
+        grants.push(take_fifo(settings.priority));
     }
     let has_realtime = grants.iter().any(|grant| grant.privilege == FIFO && grant.granted);
     // Without priority, a pinned role on a busy core is worse off than a free one: "auto" pins with a real-time
@@ -69,17 +68,47 @@ pub fn take_privileges(scenario: &Settings, role: RoleId) -> Privileges {
     let cores = cores(settings, has_realtime);
     let mut co_located = Vec::new();
     if let Some(core) = core_of(&cores, role, scenario) {
-        let mut set = CpuSet::new();
-        set.set(core);
-        let pinned = sched_setaffinity(None, &set).map_err(io::Error::from);
-        if pinned.is_ok() && has_realtime {
+        let pinned = bind_to(core);
+        if pinned.granted && has_realtime {
             co_located = RoleId::all(scenario);
             co_located
                 .retain(|peer| peer.process_role(scenario) != role && core_of(&cores, *peer, scenario) == Some(core));
         }
-        grants.push(grant("core", core.to_string(), pinned, "name cores of this machine in realtime.cores"));
+        grants.push(pinned);
     }
     Privileges { grants, has_realtime, co_located }
+}
+
+/// Takes the privileges of a probe of a core for the calling thread: the core and the default priority of roles. Without that
+/// priority it requests short time slices, as roles do.
+pub fn take_probe_privileges(core: usize) -> Vec<Grant> {
+    let _ = set_current_timer_slack(NonZero::new(1));
+    let priority = take_fifo(Realtime::default().priority);
+    if !priority.granted {
+        request_short_slices();
+    }
+    vec![priority, bind_to(core)]
+}
+
+/// Requests SCHED_FIFO for the calling thread.
+fn take_fifo(priority: i32) -> Grant {
+    let result = set_fifo(priority);
+    let remedy = if result.is_ok() { String::new() } else { priority_remedy(Path::new("/")) };
+    grant(FIFO, priority.to_string(), result, &remedy)
+}
+
+/// Binds the calling thread to a core.
+fn bind_to(core: usize) -> Grant {
+    let mut set = CpuSet::new();
+    set.set(core);
+    let result = sched_setaffinity(None, &set).map_err(io::Error::from);
+    grant("core", core.to_string(), result, "name cores of this machine in realtime.cores")
+}
+
+/// Returns the cores that the calling thread may use.
+pub fn usable_cores() -> Vec<usize> {
+    let allowed = sched_getaffinity(None).unwrap_or_default();
+    (0..CpuSet::MAX_CPU).filter(|core| allowed.is_set(*core)).collect()
 }
 
 /// Returns the remedy for a refused real-time priority; `root` is the root of the machine's files.
@@ -141,8 +170,7 @@ fn grant(privilege: &str, asked: String, result: io::Result<()>, remedy: &str) -
 fn cores(settings: &Realtime, has_realtime: bool) -> Vec<usize> {
     match &settings.cores {
         Cores::List(cores) => cores.clone(),
-        Cores::Named(NamedCores::Auto) if has_realtime => sched_getaffinity(None)
-            .map_or(Vec::new(), |allowed| (0..CpuSet::MAX_CPU).filter(|core| allowed.is_set(*core)).collect()),
+        Cores::Named(NamedCores::Auto) if has_realtime => usable_cores(),
         Cores::Named(_) => Vec::new(),
     }
 }
