@@ -34,13 +34,13 @@ fn late_report(run: &Value) -> Value {
     ]);
     json!({
         "schema": "corotate/late/v1", "run": run, "scenario": "rigid-pair", "period_us": 1000.0, "late_us": 100.0,
-        "source": "kernel", "counted": 5,
+        "source": "kernel", "counted": 5, "examined": 5,
         "ticks": [late("follower", 300, 3, "missed", 2900.0, json!([])), leader, controller],
         "causes": [
             { "cause": "late input from leader", "kind": "input", "name": "leader", "ticks": 1, "worst_us": 900.0, "sum_us": 900.0 },
             { "cause": "task \"hog\"", "kind": "task", "name": "hog", "ticks": 1, "worst_us": 890.0, "sum_us": 890.0 },
         ],
-        "patterns": [{ "period_ms": 100.0, "ticks": 2, "of": 3, "hint": "a quota" }],
+        "patterns": [{ "cause": "task \"hog\"", "period_ms": 100.0, "ticks": 2, "compared": 3, "hint": "a quota" }],
     })
 }
 
@@ -163,6 +163,49 @@ fn a_trace_has_late_ticks_cores_and_samples_on_one_axis() {
     assert!(refused.code == Some(2) && refused.codes() == ["same-file"], "{refused:?}");
     let refused = why(&bench, &["--perfetto", "no/such/file"]);
     assert!(refused.code == Some(1) && refused.codes() == ["cannot-write"], "{refused:?}");
+}
+
+/// The file is emptied before the run, so that an older trace is not taken for that of a killed run.
+#[test]
+fn a_run_writes_its_trace() {
+    let bench = Bench::new();
+    let run = |options: &[&str]| {
+        let common = ["run", "rigid-pair", "--duration", "0.5", "--set", "accept={}", "--out", "run", "--overwrite"];
+        bench.run(&[&common[..], options].concat())
+    };
+    let done = run(&[
+        "--clock",
+        "realtime",
+        "--set",
+        "realtime.late_us=0",
+        "--trace-out",
+        "new/trace.json",
+        "--junit",
+        "verdict.xml",
+    ])
+    .succeeded();
+    assert!(done.stderr.contains("new/trace.json: open it at https://ui.perfetto.dev"), "{done:?}");
+    let trace: Value = serde_json::from_slice(&fs::read(bench.path("new/trace.json")).unwrap()).unwrap();
+    let events = trace["traceEvents"].as_array().unwrap();
+    let late = events.iter().filter(|event| event["args"]["about"].is_string()).count();
+    assert!(late > 100, "every tick is late: {late}");
+    let (verdict, summary) = (fs::read_to_string(bench.path("verdict.xml")).unwrap(), summary_in(&bench.path("run")));
+    for (name, value) in [("late_ticks", &summary["late"]["counted"]), ("late_source", &summary["late"]["source"])] {
+        let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+        assert!(verdict.contains(&format!("<property name=\"{name}\" value=\"{value}\"/>")), "{verdict}");
+    }
+
+    for options in [&["--clock", "lockstep"][..], &["--clock", "realtime", "--set", "realtime.trace=\"off\""]] {
+        let refused = run(&[options, &["--trace-out", "other.json"]].concat());
+        assert!(refused.code == Some(2) && refused.codes() == ["no-late-ticks"], "{refused:?}");
+        assert!(!bench.path("other.json").exists());
+    }
+    fs::write(bench.path("taken"), "").unwrap();
+    let refused = run(&["--clock", "realtime", "--trace-out", "taken/trace.json"]);
+    assert!(refused.code == Some(1) && refused.codes() == ["cannot-write"], "{refused:?}");
+    let refused = run(&["--clock", "realtime", "--trace-out", "run/summary.json"]);
+    assert!(refused.code == Some(2) && refused.codes() == ["same-file"], "{refused:?}");
+    assert_eq!(summary_in(&bench.path("run"))["clock"], "realtime", "the result is kept");
 }
 
 #[test]
