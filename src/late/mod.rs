@@ -27,7 +27,9 @@ pub use model::{
     TracerCost,
 };
 pub use perfetto::{Perfetto, SampleMark};
-pub use tracer::{Findings, TRACER, findings, ready_path, remove_dead_traces, run_tracer};
+pub use tracer::{
+    Findings, TRACER, await_findings, findings, ready_path, remove_dead_traces, run_tracer, trace_refusal, wants_trace,
+};
 pub use words::late_table;
 pub(crate) use words::{ASCII_US, cause_rows, header, listing, pattern, sentence, us};
 

@@ -8,12 +8,13 @@ use super::explain::{causes, input_causes, slices};
 use super::{Cause, Slice, TracerCost};
 use crate::bus::domain::Domain;
 use crate::clock::{monotonic_ns, sleep_until};
+use crate::config::{ClockKind, Trace};
 use crate::runtime::{RoleId, late_log};
 use crate::scenario::Scenario;
 use crate::seat::{RoleError, join_complete, open_ledger, report_path, write_whole};
 use crate::system::name_thread;
 use crate::telemetry::LateLog;
-use corotate_trace::{Event, Instance, Page, TraceError, Window, remove_instances};
+use corotate_trace::{Event, Instance, Page, TraceError, Window, remove_instances, require_tracefs};
 use rustix::thread::sched_getaffinity;
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
@@ -25,6 +26,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub const TRACER: &str = "tracer";
 /// The beginning of the names of all trace instances of this program.
 const PREFIX: &str = "corotate-";
+/// The longest wait of another process for the findings, ns.
+const FINDINGS_NS: u64 = 2_000_000_000;
 /// Interval between two looks at the trace and at the records of late ticks, ns.
 const POLL_NS: u64 = 20_000_000;
 /// Time before a late tick that is decoded: it must include a switch on each core, ns.
@@ -80,6 +83,36 @@ pub fn ready_path(domain: &Domain) -> PathBuf {
 /// Returns the findings of the process in a domain.
 pub fn findings(domain: &Domain) -> Option<Findings> {
     serde_json::from_slice(&std::fs::read(report_path(domain.root(), TRACER)).ok()?).ok()
+}
+
+/// Returns true if a scenario asks for the kernel's trace.
+pub fn wants_trace(scenario: &Scenario) -> bool {
+    scenario.clock == ClockKind::Realtime && matches!(scenario.realtime.trace, Trace::Auto | Trace::Kernel)
+}
+
+/// Returns the reason for which this process could not trace a run of a scenario that asks for it; `None` if it could.
+pub fn trace_refusal(scenario: &Scenario) -> Option<String> {
+    require_tracefs().err().filter(|_| wants_trace(scenario)).map(|error| error.to_string())
+}
+
+/// Waits until the process of a stopped run has written its findings. Returns them, or the reason why there are none. Does not wait if
+/// the run has no such process.
+pub fn await_findings(
+    domain: &Domain,
+    scenario: &Scenario,
+    may_wait: impl Fn() -> bool,
+) -> Result<Findings, Option<String>> {
+    if !ready_path(domain).exists() {
+        return Err(trace_refusal(scenario));
+    }
+    let end_ns = monotonic_ns() + FINDINGS_NS;
+    loop {
+        match findings(domain) {
+            Some(findings) => return Ok(findings),
+            None if monotonic_ns() < end_ns && may_wait() => sleep_until(monotonic_ns() + POLL_NS / 4),
+            None => return Err(Some("the tracing process left no findings in time".to_owned())),
+        }
+    }
 }
 
 /// Removes the trace instances of dead processes of this program.
