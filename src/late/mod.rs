@@ -6,6 +6,7 @@
 //! | `delay` | the length and the parts of one delay |
 //! | `counters` | causes from the counters of a role's thread: their kinds |
 //! | `explain` | causes from the kernel's events: their names |
+//! | `last` | the last late tick of a running loop |
 //! | `tracer` | the process that records the kernel's trace beside a run |
 //! | `assemble` | the report of a run, with chains of roles and totals by cause |
 //! | `words` | late ticks in words |
@@ -15,6 +16,7 @@ mod assemble;
 mod counters;
 mod delay;
 mod explain;
+mod last;
 mod model;
 mod perfetto;
 mod tracer;
@@ -22,6 +24,7 @@ mod words;
 
 pub use assemble::report;
 pub use corotate_trace::{Cause, CauseKind};
+pub use last::{LastLate, LateFollower, LateStatus};
 pub use model::{
     CauseTotal, Chain, LateKind, LateReport, LateTick, Pattern, SCHEMA, Slice, SliceKind, Source, TickOfRole,
     TracerCost,

@@ -5,6 +5,7 @@
 
 use super::delay::Delay;
 use super::explain::{causes, input_causes, slices};
+use super::last::{Candidate, last_path};
 use super::{Cause, Slice, TracerCost};
 use crate::bus::domain::Domain;
 use crate::clock::{monotonic_ns, sleep_until};
@@ -30,6 +31,8 @@ const PREFIX: &str = "corotate-";
 const FINDINGS_NS: u64 = 2_000_000_000;
 /// Interval between two looks at the trace and at the records of late ticks, ns.
 const POLL_NS: u64 = 20_000_000;
+/// Least time between two publications of the last late tick, ns.
+const PUBLISH_NS: u64 = 200_000_000;
 /// Time before a late tick that is decoded: it must include a switch on each core, ns.
 const BEFORE_NS: u64 = 20_000_000;
 /// The same in periods of the loop.
@@ -152,6 +155,10 @@ struct Tracer<'a> {
     cores: Vec<(usize, VecDeque<Page>)>,
     roles: Vec<TracedRole>,
     findings: Vec<Finding>,
+    /// The last explained late tick.
+    last: Option<Candidate>,
+    /// The tick that was published last, and the earliest time of the next one, ns.
+    published: Option<(u64, u64)>,
     events: u64,
     overruns: u64,
 }
@@ -178,12 +185,23 @@ impl<'a> Tracer<'a> {
         });
         let cores = numbers.into_iter().map(|core| (core, VecDeque::new())).collect();
         let roles = roles.collect();
-        Ok(Self { scenario, instance, cores, roles, findings: Vec::new(), events: 0, overruns: 0 })
+        Ok(Self {
+            scenario,
+            instance,
+            cores,
+            roles,
+            findings: Vec::new(),
+            last: None,
+            published: None,
+            events: 0,
+            overruns: 0,
+        })
     }
 
     fn follow(mut self, domain: &Domain, terminated: &AtomicBool) -> Findings {
         while !terminated.load(Ordering::Relaxed) && domain.exists() {
             self.look();
+            self.publish_last(domain);
             sleep_until(monotonic_ns() + POLL_NS);
         }
         // The events around the last late tick.
@@ -208,6 +226,17 @@ impl<'a> Tracer<'a> {
         self.read_pages();
         late.sort_by_key(|(.., delay)| std::cmp::Reverse(delay.ns()));
         late.into_iter().take(EXPLAINED).for_each(|(role, index, delay)| self.explain(role, index, &delay));
+    }
+
+    /// Writes the last explained late tick for watchers, if it is a new one: at most five times per second.
+    fn publish_last(&mut self, domain: &Domain) {
+        let Some(Candidate { last, .. }) = &self.last else { return };
+        let now_ns = monotonic_ns();
+        if self.published.is_none_or(|(tick, next_ns)| tick != last.tick && now_ns >= next_ns) {
+            self.published = Some((last.tick, now_ns + PUBLISH_NS));
+            // Only a screen lacks it.
+            let _ = serde_json::to_vec(last).map(|text| write_whole(&last_path(domain), &text));
+        }
     }
 
     /// Watches the page faults of the roles' threads.
@@ -267,7 +296,12 @@ impl<'a> Tracer<'a> {
         if !slices.is_empty() {
             self.make_room();
         }
-        self.findings.push(Finding { role, index, delay_ns, causes, input_causes, slices });
+        let finding = Finding { role, index, delay_ns, causes, input_causes, slices };
+        let candidate = Candidate::new(self.scenario, delay, Some(&finding));
+        if candidate.supersedes(self.last.as_ref()) {
+            self.last = Some(candidate);
+        }
+        self.findings.push(finding);
     }
 
     /// Returns true if a delay is one of the worst, whose timelines are kept.
