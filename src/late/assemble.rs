@@ -72,7 +72,7 @@ pub fn report(
 }
 
 /// Returns a late tick with the causes of its own, and its late input as one of them.
-fn late_tick(scenario: &Scenario, delay: &Delay, found: Option<&Finding>) -> LateTick {
+pub(super) fn late_tick(scenario: &Scenario, delay: &Delay, found: Option<&Finding>) -> LateTick {
     let record = &delay.record;
     let (mut causes, slices) = match found {
         Some(finding) => (finding.causes.clone(), finding.slices.clone()),
@@ -126,7 +126,7 @@ fn link(mut ticks: Vec<(LateTick, Vec<Cause>)>, delay_ticks: u64) -> Vec<LateTic
 }
 
 /// Replaces a late input, as far as they explain it, by what kept its sender.
-fn replace_input(causes: &mut Vec<Cause>, kept: Vec<Cause>) {
+pub(super) fn replace_input(causes: &mut Vec<Cause>, kept: Vec<Cause>) {
     let Some(input) = causes.iter_mut().find(|cause| cause.kind == CauseKind::Input) else { return };
     input.us -= kept.iter().map(|cause| cause.us).sum::<f64>().min(input.us);
     for cause in kept {

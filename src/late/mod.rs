@@ -7,6 +7,7 @@
 //! | `counters` | causes from the counters of a role's thread: their kinds |
 //! | `explain` | causes from the kernel's events: their names |
 //! | `ring` | the last seconds of the kernel's trace, undecoded |
+//! | `last` | the last late tick of a running loop |
 //! | `tracer` | the process that records the kernel's trace beside a run |
 //! | `assemble` | the report of a run, with chains of roles and totals by cause |
 //! | `words` | late ticks in words |
@@ -16,6 +17,7 @@ mod assemble;
 mod counters;
 mod delay;
 mod explain;
+mod last;
 mod model;
 mod perfetto;
 mod ring;
@@ -26,13 +28,14 @@ pub use assemble::report;
 pub use corotate_trace::{Cause, CauseKind};
 pub(crate) use counters::causes as causes_by_counters;
 pub(crate) use delay::Delay;
+pub use last::{LastLate, LateFollower, LateStatus};
 pub use model::{
     CauseTotal, Chain, LateKind, LateReport, LateTick, Pattern, SCHEMA, Slice, SliceKind, Source, TickOfRole,
     TracerCost,
 };
 pub use perfetto::{Perfetto, SampleMark};
 pub use ring::{TraceRing, remove_dead_traces};
-pub use tracer::{Findings, TRACER, findings, ready_path, run_tracer};
+pub use tracer::{Findings, TRACER, await_findings, findings, ready_path, run_tracer, trace_refusal, wants_trace};
 pub use words::late_table;
 pub(crate) use words::{ASCII_US, cause_rows, header, listing, pattern, sentence, us};
 

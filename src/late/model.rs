@@ -48,7 +48,7 @@ pub struct LateReport {
     pub counted: u64,
     /// The number of examined ones. Fewer than counted if there were more than the roles keep.
     pub examined: u64,
-    /// The examined ones, in the order of time; in `summary.json` the worst ten.
+    /// The examined ones, in the order of time; in `summary.json` the worst ten, in a recording the worst thousand.
     pub ticks: Vec<LateTick>,
     /// Totals by cause, the largest sum first.
     pub causes: Vec<CauseTotal>,
@@ -215,6 +215,23 @@ impl LateReport {
         Self { ticks: self.worst_first().iter().take(count).map(short).collect(), ..self.clone() }
     }
 
+    /// Returns the report with at most `count` ticks, the worst ones, in the order of time; the worst `timelines` keep theirs.
+    #[must_use]
+    pub fn limited(&self, count: usize, timelines: usize) -> Self {
+        let mut indices: Vec<usize> = (0..self.ticks.len()).collect();
+        indices.sort_by(|a, b| self.ticks[*b].late_us.total_cmp(&self.ticks[*a].late_us));
+        let mut worst: Vec<(usize, LateTick)> =
+            indices.into_iter().take(count).map(|index| (index, self.ticks[index].clone())).collect();
+        worst.iter_mut().skip(timelines).for_each(|(_, late)| late.slices.clear());
+        worst.sort_by_key(|(index, _)| *index);
+        Self { ticks: worst.into_iter().map(|(_, late)| late).collect(), ..self.clone() }
+    }
+
+    /// Returns the number of examined ticks that are not in `ticks`.
+    pub fn left_out(&self) -> u64 {
+        self.examined.saturating_sub(self.ticks.iter().fold(0, |sum, late| sum.saturating_add(late.ticks)))
+    }
+
     /// Returns the examined ticks, the longest delay first.
     pub fn worst_first(&self) -> Vec<&LateTick> {
         self.select(None, None)
@@ -315,6 +332,21 @@ mod tests {
         for bytes in [&b"\xff\xfe"[..], b"[]", b"{\"schema\": 1}", b"{\"schema\": \"corotate/late/v1\"}"] {
             assert!(LateReport::parse(bytes).is_err());
         }
+    }
+
+    #[test]
+    fn a_limited_report_has_the_worst_ticks_and_the_same_totals() {
+        let report = fixture::report();
+        let worst = report.limited(20, 3);
+        let least_us = worst.ticks.iter().map(|late| late.late_us).fold(f64::INFINITY, f64::min);
+        assert_eq!(worst.ticks.len(), 20);
+        assert_eq!(report.ticks.iter().filter(|late| late.late_us > least_us).count(), 19);
+        assert!(worst.ticks.is_sorted_by_key(|late| late.tick));
+        assert_eq!(worst.ticks.iter().filter(|late| !late.slices.is_empty()).count(), 3);
+        assert_eq!((worst.counted, worst.examined, &worst.causes), (report.counted, report.examined, &report.causes));
+        let kept: u64 = worst.ticks.iter().map(|late| late.ticks).sum();
+        assert_eq!((worst.left_out(), report.left_out()), (report.examined - kept, 0));
+        assert!(report.limited(1000, 10).ticks == report.ticks, "enough room for all");
     }
 
     #[test]

@@ -5,24 +5,30 @@
 
 use super::delay::Delay;
 use super::explain::{causes, input_causes, slices};
+use super::last::{Candidate, last_path};
 use super::ring::{KEPT_NS, TraceRing};
 use super::{Cause, Slice, TracerCost};
 use crate::bus::domain::Domain;
 use crate::clock::{monotonic_ns, sleep_until};
+use crate::config::{ClockKind, Trace};
 use crate::runtime::{RoleId, late_log};
 use crate::scenario::Scenario;
 use crate::seat::{RoleError, join_complete, open_ledger, report_path, write_whole};
 use crate::system::name_thread;
 use crate::telemetry::LateLog;
-use corotate_trace::TraceError;
+use corotate_trace::{TraceError, require_tracefs};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// The name of the process.
 pub const TRACER: &str = "tracer";
+/// The longest wait of another process for the findings, ns.
+const FINDINGS_NS: u64 = 2_000_000_000;
 /// Interval between two looks at the trace and at the records of late ticks, ns.
 const POLL_NS: u64 = 20_000_000;
+/// Least time between two publications of the last late tick, ns.
+const PUBLISH_NS: u64 = 200_000_000;
 /// The number of late ticks whose timelines are kept.
 const TIMELINES: usize = 10;
 /// The number of events that are decoded at each look, about: more would cost a core. At the end it is larger.
@@ -67,6 +73,36 @@ pub fn findings(domain: &Domain) -> Option<Findings> {
     serde_json::from_slice(&std::fs::read(report_path(domain.root(), TRACER)).ok()?).ok()
 }
 
+/// Returns true if a scenario asks for the kernel's trace.
+pub fn wants_trace(scenario: &Scenario) -> bool {
+    scenario.clock == ClockKind::Realtime && matches!(scenario.realtime.trace, Trace::Auto | Trace::Kernel)
+}
+
+/// Returns the reason for which this process could not trace a run of a scenario that asks for it; `None` if it could.
+pub fn trace_refusal(scenario: &Scenario) -> Option<String> {
+    require_tracefs().err().filter(|_| wants_trace(scenario)).map(|error| error.to_string())
+}
+
+/// Waits until the process of a stopped run has written its findings. Returns them, or the reason why there are none. Does not wait if
+/// the run has no such process.
+pub fn await_findings(
+    domain: &Domain,
+    scenario: &Scenario,
+    may_wait: impl Fn() -> bool,
+) -> Result<Findings, Option<String>> {
+    if !ready_path(domain).exists() {
+        return Err(trace_refusal(scenario));
+    }
+    let end_ns = monotonic_ns() + FINDINGS_NS;
+    loop {
+        match findings(domain) {
+            Some(findings) => return Ok(findings),
+            None if monotonic_ns() < end_ns && may_wait() => sleep_until(monotonic_ns() + POLL_NS / 4),
+            None => return Err(Some("the tracing process left no findings in time".to_owned())),
+        }
+    }
+}
+
 /// Traces a run until `terminated`, and writes what it found to the domain.
 ///
 /// # Errors
@@ -96,6 +132,10 @@ struct Tracer<'a> {
     /// Late ticks that are not explained: role, index of the record, delay.
     pending: Vec<(usize, usize, Delay)>,
     findings: Vec<Finding>,
+    /// The last explained late tick.
+    last: Option<Candidate>,
+    /// The tick that was published last, and the earliest time of the next one, ns.
+    published: Option<(u64, u64)>,
 }
 
 struct TracedRole {
@@ -116,12 +156,14 @@ impl<'a> Tracer<'a> {
             Some(TracedRole { role, log, seen: 0, threads: Vec::new() })
         });
         let roles = roles.collect();
-        Ok(Self { scenario, ring, roles, pending: Vec::new(), findings: Vec::new() })
+        let (pending, findings) = (Vec::new(), Vec::new());
+        Ok(Self { scenario, ring, roles, pending, findings, last: None, published: None })
     }
 
     fn follow(mut self, domain: &Domain, terminated: &AtomicBool) -> Findings {
         while !terminated.load(Ordering::Relaxed) && domain.exists() {
             self.look();
+            self.publish_last(domain);
             sleep_until(monotonic_ns() + POLL_NS);
         }
         // The events around the last late tick.
@@ -156,6 +198,17 @@ impl<'a> Tracer<'a> {
         }
         let kept_ns = monotonic_ns().saturating_sub(KEPT_NS);
         self.pending.retain(|(.., delay)| delay.record.due_ns > kept_ns);
+    }
+
+    /// Writes the last explained late tick for watchers, if it is a new one: at most five times per second.
+    fn publish_last(&mut self, domain: &Domain) {
+        let Some(Candidate { last, .. }) = &self.last else { return };
+        let now_ns = monotonic_ns();
+        if self.published.is_none_or(|(tick, next_ns)| tick != last.tick && now_ns >= next_ns) {
+            self.published = Some((last.tick, now_ns + PUBLISH_NS));
+            // Only a screen lacks it.
+            let _ = serde_json::to_vec(last).map(|text| write_whole(&last_path(domain), &text));
+        }
     }
 
     /// Watches the page faults of the roles' threads.
@@ -196,7 +249,12 @@ impl<'a> Tracer<'a> {
         if !slices.is_empty() {
             self.make_room();
         }
-        self.findings.push(Finding { role, index, delay_ns, causes, input_causes, slices });
+        let finding = Finding { role, index, delay_ns, causes, input_causes, slices };
+        let candidate = Candidate::new(self.scenario, delay, Some(&finding));
+        if candidate.supersedes(self.last.as_ref()) {
+            self.last = Some(candidate);
+        }
+        self.findings.push(finding);
     }
 
     /// Returns true if a delay is one of the worst, whose timelines are kept.

@@ -66,7 +66,11 @@ pub fn header(report: &LateReport, unit: &str) -> String {
     };
     let (counted, examined) = (report.counted, report.examined);
     let number = if counted == examined { counted.to_string() } else { format!("{examined} of {counted}") };
-    format!("{number} late ticks examined; limit {} {unit}; causes from {source}", plain(report.late_us))
+    let part = match report.left_out() {
+        0 => String::new(),
+        left_out => format!(" ({left_out} short ones left out of this file)"),
+    };
+    format!("{number} late ticks examined{part}; limit {} {unit}; causes from {source}", plain(report.late_us))
 }
 
 /// Returns late ticks with their chains of causes, one cause per line.

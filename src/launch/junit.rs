@@ -4,10 +4,14 @@
 
 use super::{Action, Criterion, Summary, exact};
 use crate::config::RunId;
+use crate::late::{CauseTotal, LateReport};
 use quick_xml::Writer;
 use std::io;
 
 type Xml = Writer<Vec<u8>>;
+
+/// The largest number of causes of late ticks in the properties.
+const CAUSES: usize = 8;
 
 /// The result of a case.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -81,14 +85,25 @@ fn properties(xml: &mut Xml, run: RunId, summary: Option<&Summary>) -> io::Resul
         properties.extend(rejected.map(|link| {
             (format!("rejected_samples of {} at {}", link.service, link.reader), link.rejected.to_string())
         }));
+        properties.extend(summary.late.iter().flat_map(late_ticks));
     }
     xml.create_element("properties").write_inner_content(|xml| {
         properties.iter().try_for_each(|(name, value)| {
-            let attributes = [("name", name.as_str()), ("value", value)];
+            let [name, value] = [name, value].map(|text| printable(text));
+            let attributes = [("name", name.as_str()), ("value", &value)];
             xml.create_element("property").with_attributes(attributes).write_empty().map(drop)
         })
     })?;
     Ok(())
+}
+
+/// Returns the number of late ticks, the source of their causes, and the number for each of the largest causes.
+fn late_ticks(late: &LateReport) -> Vec<(String, String)> {
+    let source: &str = late.source.into();
+    let totals = [("late_ticks", late.counted.to_string()), ("late_source", source.to_owned())];
+    let totals = totals.map(|(name, value)| (name.to_owned(), value));
+    let cause = |total: &CauseTotal| (format!("late_ticks by {}", total.cause), total.ticks.to_string());
+    totals.into_iter().chain(late.causes.iter().take(CAUSES).map(cause)).collect()
 }
 
 /// Returns the cases: the run, its counters, and the criteria in their order.
@@ -142,7 +157,7 @@ impl Case {
     }
 }
 
-/// Returns a text without the characters that XML does not allow: a role's output may be anything.
+/// Returns a text without the characters that XML does not allow: a role's output and the name of a task may be anything.
 fn printable(text: &str) -> String {
     let held = |c: char| matches!(c, '\t' | '\n' | ' '..='\u{d7ff}' | '\u{e000}'..='\u{fffd}' | '\u{10000}'..);
     text.chars().map(|c| if held(c) { c } else { char::REPLACEMENT_CHARACTER }).collect()
@@ -151,6 +166,7 @@ fn printable(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::late::fixture;
 
     fn criterion(value: Option<f64>, holds: Option<bool>) -> Criterion {
         let name = "sync_error_rad_s_max".to_owned();
@@ -169,6 +185,19 @@ mod tests {
         let nothing = judge(&criterion(None, Some(false)));
         assert_eq!(nothing, Verdict::Failed("nothing was measured; the limit is 1e-6".into()));
         assert!(matches!(judge(&criterion(None, None)), Verdict::Skipped(_)));
+    }
+
+    #[test]
+    fn late_ticks_are_counted_for_the_eight_largest_causes() {
+        let report = fixture::report();
+        let properties = late_ticks(&report);
+        let value = |name: &str| properties.iter().find(|property| property.0 == name).map(|property| &*property.1);
+        assert_eq!((value("late_ticks"), value("late_source")), (Some(&*report.counted.to_string()), Some("kernel")));
+        assert!(report.causes.len() > CAUSES);
+        assert_eq!(properties.len(), 2 + CAUSES);
+        let [first, .., ninth] = &report.causes[..=CAUSES] else { panic!("{:?}", report.causes) };
+        assert_eq!(value(&format!("late_ticks by {}", first.cause)), Some(&*first.ticks.to_string()));
+        assert_eq!(value(&format!("late_ticks by {}", ninth.cause)), None);
     }
 
     /// Another parser reads the file, whatever a failing role prints.

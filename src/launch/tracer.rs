@@ -6,11 +6,9 @@ use super::LaunchError;
 use super::companion::Companion;
 use super::janitor::Janitor;
 use crate::bus::domain::Domain;
-use crate::config::{ClockKind, Trace};
-use crate::late::{Findings, LateReport, TRACER, findings, ready_path, report};
+use crate::late::{Findings, LateReport, TRACER, findings, ready_path, report, trace_refusal, wants_trace};
 use crate::scenario::Scenario;
 use crate::telemetry::RoleReport;
-use corotate_trace::require_tracefs;
 use std::process::Command;
 
 /// The tracing process of a run, if it has one.
@@ -23,10 +21,8 @@ pub(super) struct TracerWatch {
 impl TracerWatch {
     /// Starts the process if the scenario asks for the kernel's trace and the machine permits it.
     pub fn start(scenario: &Scenario, domain: &Domain) -> Result<Self, LaunchError> {
-        let asked =
-            scenario.clock == ClockKind::Realtime && matches!(scenario.realtime.trace, Trace::Auto | Trace::Kernel);
-        let note = require_tracefs().err().filter(|_| asked).map(|error| error.to_string());
-        let arguments = (asked && note.is_none()).then_some(|command: &mut Command| {
+        let note = trace_refusal(scenario);
+        let arguments = (wants_trace(scenario) && note.is_none()).then_some(|command: &mut Command| {
             command.arg(TRACER).arg("--domain").arg(domain.root());
         });
         Ok(Self { companion: Companion::start(TRACER, arguments)?, note })

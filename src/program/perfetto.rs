@@ -11,22 +11,26 @@ use crate::system::remedy;
 use std::fs;
 use std::fs::File;
 use std::io::{self, BufWriter};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-/// Writes a trace of the run in `directory` to the file `out`: its late ticks, and the samples if it was recorded.
+/// Writes a trace of the run in `source`, a directory or a recording, to the file `out`: its late ticks, and the samples if it was
+/// recorded.
 ///
 /// # Errors
 /// The exit code and the reason.
-pub fn write(directory: &Path, report: &LateReport, out: &Path) -> Result<(), (Exit, Failure)> {
-    let same = |name: &&str| {
-        let pair = [&directory.join(name), out].map(fs::canonicalize);
-        matches!(pair, [Ok(a), Ok(b)] if a == b)
+pub fn write(source: &Path, report: &LateReport, out: &Path) -> Result<(), (Exit, Failure)> {
+    let results = if source.is_dir() {
+        [LATE, RECORDING, SUMMARY].map(|name| source.join(name)).to_vec()
+    } else {
+        vec![source.to_owned()]
     };
-    if let Some(name) = [LATE, RECORDING, SUMMARY].into_iter().find(same) {
+    let same = |file: &&PathBuf| matches!([file, out].map(fs::canonicalize), [Ok(a), Ok(b)] if a == b);
+    if let Some(file) = results.iter().find(same) {
+        let name = file.file_name().unwrap_or_default().display();
         let text = format!("{} is the run's {name}; name another file", out.display());
         return Err((Exit::Usage, Failure::new("same-file", text)));
     }
-    let recording = open(directory, report)?;
+    let recording = open(source, report)?;
     let failed = |error: io::Error| {
         let text = format!("cannot write {}: {error}; {}, or name another file", out.display(), remedy(&error));
         (Exit::Failure, Failure::new("cannot-write", text))
@@ -41,8 +45,8 @@ pub fn write(directory: &Path, report: &LateReport, out: &Path) -> Result<(), (E
 }
 
 /// Opens the recording of the run, if it has one.
-fn open(directory: &Path, report: &LateReport) -> Result<Option<Recording>, (Exit, Failure)> {
-    let file = directory.join(RECORDING);
+fn open(source: &Path, report: &LateReport) -> Result<Option<Recording>, (Exit, Failure)> {
+    let file = if source.is_dir() { source.join(RECORDING) } else { source.to_owned() };
     if !file.exists() {
         return Ok(None);
     }

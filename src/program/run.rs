@@ -5,6 +5,7 @@ use super::color::{Color, paint};
 use super::foxglove;
 use super::hosts::{self, KeyArguments};
 use super::output::{Exit, Failure, exit_of, fail, print, remark};
+use super::perfetto;
 use super::scenario::{Change, changed, load, stem};
 use super::shipped::name;
 use super::signals::catch_signals;
@@ -12,6 +13,7 @@ use crate::config::{ClockKind, RunId};
 use crate::doctor::Machine;
 use crate::files;
 use crate::hosts::{Address, HostEndpoint};
+use crate::late::LateReport;
 use crate::launch::{
     Action, Launch, Outcome, Progress, ResultsError, Summary, check_cores, claim, exact, junit, make_directory,
     make_latest, new_run, table, tick_words, write_run,
@@ -67,6 +69,9 @@ pub struct Arguments {
     /// Write the verdict as JUnit XML, one test case per criterion
     #[arg(long, value_name = "FILE", hide_short_help = true)]
     junit: Option<PathBuf>,
+    /// Write late ticks and samples as a trace for ui.perfetto.dev, in real time
+    #[arg(long, value_name = "FILE", hide_short_help = true)]
+    trace_out: Option<PathBuf>,
     /// Record every sample to run.mcap beside the results
     #[arg(long)]
     record: bool,
@@ -116,7 +121,9 @@ Examples:
   corotate run pair.toml --external follower
                                    wait for hardware as the follower
   corotate run pair.toml --junit verdict.xml --require-rt
-                                   as a test, with real time required";
+                                   as a test, with real time required
+  corotate run pair.toml --trace-out trace.json
+                                   late ticks and cores on one time axis";
 
 impl Arguments {
     fn changes(&self) -> impl Iterator<Item = Change<'_>> {
@@ -146,6 +153,7 @@ impl Arguments {
         self.check_external(&scenario)
             .and_then(|()| self.check_foxglove(&scenario))
             .and_then(|()| self.check_host(&scenario))
+            .and_then(|()| self.check_trace(&scenario))
             .and_then(|()| Ok(check_cores(&scenario)?))
             .map_err(unusable)?;
         Ok(scenario)
@@ -198,6 +206,17 @@ impl Arguments {
             }
             false => refuse("no-such-host", format!("the scenario has no such host; choose from {}", names.join(", "))),
         }
+    }
+
+    fn check_trace(&self, scenario: &Scenario) -> Result<(), Failure> {
+        if self.trace_out.is_none() || scenario.keeps_late_ticks() {
+            return Ok(());
+        }
+        let reason = match scenario.clock {
+            ClockKind::Realtime => "realtime.trace is \"off\"; set it to \"auto\"".to_owned(),
+            clock => format!("no tick is late with the clock {}; use --clock realtime", clock.name()),
+        };
+        Err(Failure::new("no-late-ticks", format!("--trace-out: {reason}")))
     }
 
     fn check_external(&self, scenario: &Scenario) -> Result<(), Failure> {
@@ -266,11 +285,27 @@ pub fn run(arguments: &Arguments) -> Exit {
 }
 
 fn write_junit(path: &Path, name: &str, run: RunId, result: Result<&Summary, &str>) -> Result<(), Exit> {
+    replace(path, junit(name, run, result).as_bytes(), "--junit").map_err(|failure| fail(Exit::Failure, failure))
+}
+
+/// Writes the file that an option names, and its directory if that is missing.
+fn replace(path: &Path, content: &[u8], option: &str) -> Result<(), Failure> {
     let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty());
     let made = directory.map_or(Ok(()), files::create_directories);
-    made.and_then(|()| files::write(path, junit(name, run, result).as_bytes()))
-        .map_err(|error| format!("cannot write {}: {error}; name another file with --junit", path.display()))
-        .map_err(|reason| fail(Exit::Failure, Failure::new("cannot-write", reason)))
+    made.and_then(|()| files::write(path, content)).map_err(|error| {
+        let reason = format!("cannot write {}: {error}; name another file with {option}", path.display());
+        Failure::new("cannot-write", reason)
+    })
+}
+
+/// Writes the trace of a finished run, if `--trace-out` is given.
+fn write_trace(arguments: &Arguments, directory: &Path, late: Option<&LateReport>) -> Result<(), RunFailure> {
+    let (Some(out), Some(late)) = (&arguments.trace_out, late) else { return Ok(()) };
+    perfetto::write(directory, late, out).map_err(|(exit, failure)| RunFailure { exit, failure })?;
+    if !arguments.quiet {
+        remark(&format!("{}: open it at https://ui.perfetto.dev", out.display()));
+    }
+    Ok(())
 }
 
 /// Runs a scenario, writes its results and prints its table. The returned outcome owns files that are removed on drop.
@@ -291,6 +326,8 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
     if let Some(names) = claim.removed_names().filter(|_| !arguments.quiet) {
         remark(&format!("removed from {}: {names}", directory.display()));
     }
+    // Replaces an older trace, in case this process is killed.
+    arguments.trace_out.as_deref().map_or(Ok(()), |out| replace(out, b"", "--trace-out")).map_err(broken)?;
     let signal = catch_signals().map_err(broken)?;
     let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
     let fleets = fleets.map(|body| body.name.to_string()).collect();
@@ -326,6 +363,7 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
         remark(&format!("runs/latest does not link to this run: {error}; name {} instead", directory.display()));
     }
     reported.map_err(broken)?;
+    write_trace(arguments, &directory, outcome.late.as_ref())?;
     Ok((summary, outcome))
 }
 

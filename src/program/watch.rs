@@ -37,6 +37,7 @@ Keys: q: quit; space: pause; up, down, tab: select a signal; left, right:
 scroll its fields. Latencies are median/99 % of the last 4096 samples, from the
 samples' stamps: due-sent from the tick's due time to the sending of the role's
 sample, in-sent from the sending of the input to that of the role's sample.
+In real time a line has the number of late ticks, and the last one's cause.
 
 Examples:
   corotate run & corotate watch    your newest run
@@ -98,6 +99,7 @@ fn json(model: &Model) -> String {
         "last_tick": model.last_tick,
         "ended": model.ended,
         "roles": model.roles.iter().map(role).collect::<Vec<_>>(),
+        "late": model.late,
         "errors": model.series.iter().map(|series| (&series.name, series.last)).collect::<BTreeMap<_, _>>(),
         "events": model.events.iter().map(|event| serde_json::json!({ "tick": event.tick, "text": event.text })).collect::<Vec<_>>(),
         "signals": model.signals.iter().map(|signal| (&signal.name, fields(&signal.fields))).collect::<BTreeMap<_, _>>(),

@@ -1,10 +1,12 @@
 //! `corotate why`: prints the late ticks of a run with their causes.
 
 use super::output::{CommandResult, Exit, Failure, fail, harmless, remark, say};
-use super::{perfetto, runs};
+use super::{perfetto, record, runs};
 use crate::files;
 use crate::late::{ASCII_US, LateReport, LateTick, TickOfRole, header, listing, pattern};
-use crate::launch::{LATE, SUMMARY, Summary};
+use crate::launch::{LATE, RECORDING, SUMMARY, Summary};
+use crate::record::{RecordError, Recording};
+use std::collections::BTreeSet;
 use std::fmt::Write;
 use std::io::ErrorKind;
 use std::num::NonZeroUsize;
@@ -48,14 +50,17 @@ Examples:
   corotate why                     the newest run in runs/
   corotate why runs/pair --tick 3277
                                    every role at that tick
+  corotate why run.mcap            a recording alone: the worst 1000 late ticks
   corotate why --role controller -n 50
   corotate why --perfetto trace.json";
 
 /// A run with its late ticks.
 struct Run {
-    directory: PathBuf,
+    /// The directory or the recording.
+    path: PathBuf,
     late: LateReport,
-    summary: Option<Summary>,
+    /// The last tick and the roles, if they are known.
+    extent: Option<(u64, Vec<String>)>,
 }
 
 /// A late tick as the JSON has it.
@@ -82,7 +87,7 @@ pub fn why(arguments: &Arguments) -> CommandResult {
     let run = open(arguments.run.as_deref()).map_err(|(exit, failure)| fail(exit, failure))?;
     run.check(arguments).map_err(|failure| fail(Exit::Usage, failure))?;
     if let Some(out) = &arguments.perfetto {
-        let written = perfetto::write(&run.directory, &run.late, out);
+        let written = perfetto::write(&run.path, &run.late, out);
         written.map_err(|(exit, failure)| fail(exit, failure))?;
         remark(&format!("{}: open it at https://ui.perfetto.dev", out.display()));
     }
@@ -94,14 +99,25 @@ pub fn why(arguments: &Arguments) -> CommandResult {
     say(&harmless(&text(&run.late, arguments, &selected)))
 }
 
-/// Opens the run that the command line names.
+/// Opens the run that the command line names: a directory with results, or a recording alone.
 fn open(given: Option<&Path>) -> Result<Run, (Exit, Failure)> {
     let path = runs::results(given).map_err(|failure| (Exit::Usage, failure))?;
     if !path.exists() {
         let text = format!("{} does not exist; name a run's directory", path.display());
         return Err((Exit::Usage, Failure::new("no-such-run", text)));
     }
-    let directory = if path.is_dir() { path } else { path.parent().unwrap_or(Path::new("")).to_owned() };
+    if path.is_dir() {
+        return open_directory(path);
+    }
+    let reason = "its clock is not real time, realtime.trace was \"off\", it has no end, or an older version made it";
+    open_recording(&path)?.ok_or_else(|| {
+        let text = format!("{} has no late ticks: {reason}; name the run's directory", path.display());
+        (Exit::Usage, Failure::new("no-late-ticks", text))
+    })
+}
+
+/// Opens a directory with results.
+fn open_directory(directory: PathBuf) -> Result<Run, (Exit, Failure)> {
     let failed = |path: &Path, error| {
         (Exit::Failure, Failure::new("cannot-read", format!("cannot read {}: {error}", path.display())))
     };
@@ -111,19 +127,41 @@ fn open(given: Option<&Path>) -> Result<Run, (Exit, Failure)> {
         Err(error) => Err(failed(&directory.join(name), error)),
     };
     let summary = read(SUMMARY)?.and_then(|bytes| Summary::parse(std::str::from_utf8(&bytes).ok()?).ok());
-    let Some(bytes) = read(LATE)? else { return Err((Exit::Usage, missing(&directory, summary.as_ref()))) };
-    let late = LateReport::parse(&bytes).map_err(|reason| {
-        let file = directory.join(LATE);
-        let text = format!("cannot read {}: {reason}; run again, or use the version that wrote it", file.display());
-        (Exit::Usage, Failure::new("unreadable-late-ticks", text))
-    })?;
+    let late = match read(LATE)? {
+        Some(bytes) => LateReport::parse(&bytes).map_err(|reason| unreadable(&directory.join(LATE), &reason))?,
+        None => {
+            let recording = directory.join(RECORDING);
+            let recorded = if recording.exists() { open_recording(&recording)? } else { None };
+            recorded.ok_or_else(|| (Exit::Usage, missing(&directory, summary.as_ref())))?.late
+        }
+    };
     if let Some(summary) = summary.as_ref().filter(|summary| summary.run != late.run) {
         let named = |run: Option<_>| run.map_or("a run without an identifier".to_owned(), |run| format!("run {run}"));
         let (a, b) = (named(late.run), named(summary.run));
         let text = format!("in {} {LATE} belongs to {a} and {SUMMARY} to {b}; run again", directory.display());
         return Err((Exit::Usage, Failure::new("two-runs", text)));
     }
-    Ok(Run { directory, late, summary })
+    let extent = |summary: Summary| (summary.last_tick, summary.books.roles.into_keys().collect());
+    Ok(Run { path: directory, late, extent: summary.map(extent) })
+}
+
+/// Opens a recording; returns `None` if it has no late ticks.
+fn open_recording(path: &Path) -> Result<Option<Run>, (Exit, Failure)> {
+    let refused = |error: RecordError| (record::exit_of(&error), error.into());
+    let recording = Recording::open(path).map_err(refused)?;
+    // The late ticks of an incomplete recording are whole.
+    if let Err(error @ RecordError::Damaged { .. }) = recording.require_whole() {
+        return Err(refused(error));
+    }
+    let late = recording.late_ticks().map_err(|reason| unreadable(path, &reason))?;
+    let roles: BTreeSet<&str> = recording.signals().iter().map(|signal| &*signal.role).collect();
+    let extent = (recording.info().last_tick, roles.into_iter().map(str::to_owned).collect());
+    Ok(late.map(|late| Run { path: path.to_owned(), late, extent: Some(extent) }))
+}
+
+fn unreadable(path: &Path, reason: &str) -> (Exit, Failure) {
+    let text = format!("cannot read {}: {reason}; run again, or use the version that wrote it", path.display());
+    (Exit::Usage, Failure::new("unreadable-late-ticks", text))
 }
 
 /// Returns the reason why a directory has no late ticks, with a remedy.
@@ -146,18 +184,18 @@ fn missing(directory: &Path, summary: Option<&Summary>) -> Failure {
 impl Run {
     /// Checks that the run has the wanted tick and role, as far as this is known.
     fn check(&self, arguments: &Arguments) -> Result<(), Failure> {
-        let Some(summary) = &self.summary else { return Ok(()) };
-        if let Some(tick) = arguments.tick.filter(|tick| *tick > summary.last_tick) {
-            let text = format!("--tick {tick}: the last tick of the run is {}", summary.last_tick);
+        let Some((last_tick, roles)) = &self.extent else { return Ok(()) };
+        if let Some(tick) = arguments.tick.filter(|tick| tick > last_tick) {
+            let text = format!("--tick {tick}: the last tick of the run is {last_tick}");
             return Err(Failure::new("out-of-range", text));
         }
-        let roles = &summary.books.roles;
-        let known = |role: &str| roles.contains_key(role) || self.late.ticks.iter().any(|late| late.role == role);
+        let known = |role: &str| {
+            roles.iter().any(|known| known == role) || self.late.ticks.iter().any(|late| late.role == role)
+        };
         match arguments.role.as_deref().filter(|role| !known(role)) {
             None => Ok(()),
             Some(role) => {
-                let names: Vec<&str> = roles.keys().map(String::as_str).collect();
-                let text = format!("--role {role}: the run has no such role; its roles are: {}", names.join(", "));
+                let text = format!("--role {role}: the run has no such role; its roles are: {}", roles.join(", "));
                 Err(Failure::new("unknown-role", text))
             }
         }
@@ -191,11 +229,12 @@ fn text(late: &LateReport, arguments: &Arguments, selected: &[&LateTick]) -> Str
 fn nothing(late: &LateReport, arguments: &Arguments) -> String {
     let role = arguments.role.as_ref().map_or("any role".to_owned(), |role| format!("role {role}"));
     let which = arguments.tick.map_or("no tick was late".to_owned(), |tick| format!("tick {tick} was not late"));
-    if late.counted > late.examined {
+    let hidden = late.counted.saturating_sub(late.examined) + late.left_out();
+    if hidden > 0 {
         let tick = arguments.tick.map_or("no examined late tick".to_owned(), |tick| {
             format!("tick {tick} is not among the examined late ticks")
         });
-        return format!("{tick} in {role}; {} were not examined", late.counted - late.examined);
+        return format!("{tick} in {role}; {hidden} were not examined or not recorded");
     }
     format!("{which} in {role}")
 }
@@ -206,7 +245,7 @@ fn json(run: &Run, shown: &[&LateTick], selected: usize) -> String {
     let ticks: Vec<_> = shown.iter().map(|tick| ShownTick::new(late, tick)).collect();
     let object = serde_json::json!({
         "schema": SCHEMA,
-        "directory": run.directory.display().to_string(),
+        "directory": run.path.display().to_string(),
         "run": late.run,
         "scenario": late.scenario,
         "period_us": late.period_us,

@@ -11,6 +11,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::ClockKind;
+use crate::late::{self, LateReport, await_findings};
 use crate::runtime::{
     Backoff, RoleId, depths, join_at_low_priority, report, take_lowest_realtime_priority, topic, window_ticks,
     with_realtime_priority,
@@ -61,6 +62,9 @@ pub fn run_recorder(options: &RecorderOptions, terminated: &AtomicBool) -> Resul
     let ended =
         follow(&mut recorder, &mut launcher, credit_ticks, &|| terminated.load(Ordering::Relaxed) || !domain.exists());
     with_realtime_priority(|| recorder.close_links());
+    let stopped = launcher.schedule().is_ok_and(|schedule| Phase::from_number(schedule.phase) == Phase::Stop);
+    let late = if stopped { late_ticks(&domain, &scenario, terminated) } else { None };
+    late.iter().for_each(|late| recorder.add_late_ticks(late));
     let report = recorder.finish(&role_reports(&domain, &scenario), ended.as_ref().err());
     let path = report_path(domain.root(), RECORDER);
     let text = serde_json::to_vec(&report).expect("a report of plain values is JSON");
@@ -173,6 +177,20 @@ fn role_reports(domain: &Domain, scenario: &Scenario) -> Vec<RoleReport> {
         final_report.or_else(|| Some(report(scenario, role, &ledger?, Vec::new(), Vec::new())))
     };
     RoleId::all(scenario).into_iter().filter_map(counters).collect()
+}
+
+/// Returns the late ticks of a stopped run, as the launcher will write them. Waits for the tracing process, but not for roles of other
+/// hosts.
+fn late_ticks(domain: &Domain, scenario: &Scenario, terminated: &AtomicBool) -> Option<LateReport> {
+    if !scenario.keeps_late_ticks() {
+        return None;
+    }
+    let may_wait = || !terminated.load(Ordering::Relaxed) && domain.exists();
+    let (findings, note) = match await_findings(domain, scenario, may_wait) {
+        Ok(findings) => (Some(findings), None),
+        Err(note) => (None, note),
+    };
+    late::report(scenario, &role_reports(domain, scenario), findings, note)
 }
 
 /// The recorder's links to and from the launcher.

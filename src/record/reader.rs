@@ -6,10 +6,11 @@
 //! can fill, nor use a sample whose checksum is wrong.
 
 use super::RecordError;
-use super::recorder::{END, RUN, SCHEMA, SignalReport, layouts};
+use super::recorder::{END, LATE, LATE_REPORT, RUN, SCHEMA, SignalReport, layouts};
 use super::writer::{CHECKSUM, checksum};
 use crate::config::{RunId, ScriptedFault};
 use crate::files;
+use crate::late::LateReport;
 use crate::sample::{CDR_HEADER, FieldKind, Layout, Order, Place, Stamp};
 use crate::scenario::Scenario;
 use crate::telemetry::{Grant, Ticks};
@@ -65,6 +66,8 @@ pub struct Recording {
     flaw: Option<Flaw>,
     /// The last recorded tick.
     last_tick: Option<u64>,
+    /// The late ticks, as JSON.
+    late: Option<String>,
 }
 
 /// The reason that a file cannot be read to its end.
@@ -184,7 +187,8 @@ impl Recording {
             signal.samples = counts.get(&signal.channel).copied().unwrap_or(0);
         }
         let last_tick = ticks.into_values().filter(|tick| *tick <= info.last_tick).max();
-        Ok(Self { path: path.to_owned(), info, signals, flaw, last_tick })
+        let late = content.metadata.get_mut(LATE).and_then(|entries| entries.remove(LATE_REPORT));
+        Ok(Self { path: path.to_owned(), info, signals, flaw, last_tick, late })
     }
 
     /// Returns the file's path.
@@ -200,6 +204,15 @@ impl Recording {
     /// Returns the signals in the order of a tick.
     pub fn signals(&self) -> &[SignalInfo] {
         &self.signals
+    }
+
+    /// Returns the late ticks of a run in real time: the worst ones, if there were many. `None` if the file has no end, or the recorder
+    /// left the run before its end.
+    ///
+    /// # Errors
+    /// The reason, if they have another layout.
+    pub fn late_ticks(&self) -> Result<Option<LateReport>, String> {
+        self.late.as_ref().map(|text| LateReport::parse(text.as_bytes())).transpose()
     }
 
     /// Returns the first damage to the file, if any. The part before it is readable.

@@ -5,6 +5,7 @@ use super::taps::{SignalCounters, Taps};
 use super::writer::Writer;
 use crate::bus::AnyBus;
 use crate::clock::monotonic_ns;
+use crate::late::LateReport;
 use crate::runtime::{RoleId, ports};
 use crate::sample::Layout;
 use crate::scenario::Scenario;
@@ -26,6 +27,13 @@ pub const SCHEMA: &str = "corotate/recording/v2";
 pub const RUN: &str = "corotate.run";
 /// Name of the metadata record at the end.
 pub const END: &str = "corotate.end";
+/// Name of the metadata record with the late ticks, before the one at the end.
+pub const LATE: &str = "corotate.late";
+/// The key of its JSON.
+pub const LATE_REPORT: &str = "report";
+/// The largest number of late ticks in a recording, and of their timelines.
+const LATE_TICKS: usize = 1000;
+const TIMELINES: usize = 10;
 
 /// The result of a recording.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -137,6 +145,7 @@ pub struct Recorder {
     writer: Writer,
     file: String,
     run: BTreeMap<String, String>,
+    late: Option<LateReport>,
     begun: bool,
 }
 
@@ -152,6 +161,7 @@ impl Recorder {
             writer: Writer::create(path)?,
             file: path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
             run: run_metadata(scenario),
+            late: None,
             begun: false,
         })
     }
@@ -196,6 +206,11 @@ impl Recorder {
         self.signals.extend(self.taps.close().into_iter().map(SignalReport::new));
     }
 
+    /// Adds the late ticks of the run to the end of the file: the worst thousand, and the timelines of the worst ten.
+    pub fn add_late_ticks(&mut self, report: &LateReport) {
+        self.late = Some(report.limited(LATE_TICKS, TIMELINES));
+    }
+
     /// Ends the file with the counters of the recording and of the roles. `problem` is the reason of an early end.
     pub fn finish(mut self, roles: &[RoleReport], problem: Option<&RecordError>) -> RecordingReport {
         self.close_links();
@@ -225,6 +240,10 @@ impl Recorder {
     fn end(&mut self, report: &RecordingReport, roles: &[RoleReport]) -> Result<u64, RecordError> {
         if !self.begun {
             self.start(0, Some(0))?;
+        }
+        if let Some(late) = self.late.take() {
+            // Without room for them the file has no late ticks, but is whole.
+            self.writer.metadata_if_room(LATE, [(LATE_REPORT.to_owned(), json(&late))].into())?;
         }
         let grants: BTreeMap<&str, _> = roles.iter().map(|role| (role.role.as_str(), &role.grants)).collect();
         let ticks: BTreeMap<&str, _> = roles.iter().map(|role| (role.role.as_str(), role.ticks)).collect();

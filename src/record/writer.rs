@@ -104,6 +104,19 @@ impl Writer {
         self.close_chunk()
     }
 
+    /// Writes a metadata record like [`metadata`](Self::metadata), unless the disk has no room for it beside the end of the file.
+    ///
+    /// # Errors
+    /// [`RecordError::Write`].
+    pub fn metadata_if_room(&mut self, name: &str, entries: BTreeMap<String, String>) -> Result<(), RecordError> {
+        let bytes: usize = entries.iter().map(|(key, value)| key.len() + value.len()).sum();
+        match self.reserve(bytes) {
+            Err(RecordError::Full { .. }) => Ok(()),
+            Err(error) => Err(error),
+            Ok(()) => self.metadata(name, entries),
+        }
+    }
+
     /// Closes the current chunk if it is large or old enough.
     ///
     /// # Errors
@@ -121,11 +134,11 @@ impl Writer {
         Ok(())
     }
 
-    /// Reserves space for one more chunk and the end of the file.
-    fn reserve(&mut self, sample_bytes: usize) -> Result<(), RecordError> {
+    /// Reserves space for one more chunk, further bytes, and the end of the file.
+    fn reserve(&mut self, bytes: usize) -> Result<(), RecordError> {
         let end = END_BYTES + self.chunks * (CHUNK_INDEX_BYTES + CHANNEL_INDEX_BYTES * self.channels);
-        // Incompressible data grows slightly, and the last sample may exceed the chunk size.
-        let chunk = (CHUNK_BYTES + CHUNK_BYTES / 4 + 2 * sample_bytes) as u64;
+        // Incompressible data grows slightly.
+        let chunk = (CHUNK_BYTES + CHUNK_BYTES / 4 + bytes) as u64;
         match fallocate(self.file.as_fd(), FallocateFlags::KEEP_SIZE, self.whole_bytes, chunk + end) {
             Err(error @ (Errno::NOSPC | Errno::DQUOT | Errno::FBIG)) => {
                 Err(RecordError::Full { path: self.path.clone(), source: error.into() })
@@ -199,7 +212,8 @@ impl MessageSink for Writer {
         body: &[u8],
     ) -> Result<(), RecordError> {
         if self.chunk_began_ns.is_none() {
-            self.reserve(body.len())?;
+            // The last sample may exceed the chunk size.
+            self.reserve(2 * body.len())?;
             self.chunk_began_ns = Some(monotonic_ns());
         }
         frame(body, &mut self.frame);

@@ -38,6 +38,7 @@ impl Source {
 
     fn recording(path: &Path) -> Result<Self, ReportError> {
         let recording = Recording::open(path)?;
+        let late = recorded_late_ticks(&recording)?;
         let missing = "verdict, counters and latencies are missing: a recording does not contain them; give the run's \
                        directory, with summary.json and latency/, to `corotate report`";
         Ok(Self {
@@ -45,7 +46,7 @@ impl Source {
             scenario: Some(recording.scenario()?),
             recording: Some(recording),
             curves: Vec::new(),
-            late: None,
+            late,
             missing: vec![missing.to_owned()],
         })
     }
@@ -84,7 +85,8 @@ impl Source {
             };
             missing.push(format!("latencies are missing: {reason}"));
         }
-        let late = late_ticks(&at(LATE))?;
+        let recorded = || recording.as_ref().map_or(Ok(None), recorded_late_ticks);
+        let late = late_ticks(&at(LATE))?.map_or_else(recorded, |late| Ok(Some(late)))?;
         if late.is_none() && summary.as_ref().is_some_and(|summary| summary.clock == ClockKind::Realtime.name()) {
             let reason = "realtime.trace was \"off\", or an older version made the run";
             missing.push(format!("the causes of late ticks are missing: {reason}"));
@@ -138,6 +140,11 @@ fn late_ticks(path: &Path) -> Result<Option<LateReport>, ReportError> {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
         Err(source) => Err(ReportError::Read { path: path.to_owned(), source }),
     }
+}
+
+/// Returns the late ticks in a recording, if it has them.
+fn recorded_late_ticks(recording: &Recording) -> Result<Option<LateReport>, ReportError> {
+    recording.late_ticks().map_err(|reason| ReportError::LateTicks { path: recording.path().to_owned(), reason })
 }
 
 /// Reads all `<role>.<stage>.hgrm` of a directory, in the order of the summary.

@@ -2,6 +2,7 @@
 //!
 //! Must not lose a peak: an entry that stands for several values keeps the largest.
 
+use crate::late::LateStatus;
 use crate::sample::RoleState;
 use crate::telemetry::{quantile, sorted};
 use std::collections::VecDeque;
@@ -36,6 +37,8 @@ pub struct Model {
     pub paused: bool,
     /// The roles, in the order of a tick.
     pub roles: Vec<RoleLine>,
+    /// The late ticks, in real time.
+    pub late: Option<LateStatus>,
     /// The errors, and V if the law has one.
     pub series: Vec<Series>,
     /// The events, the newest last.

@@ -1,6 +1,7 @@
 //! Draws the model. 80 by 24 cells suffice; the screen states how many roles it omits.
 
 use super::model::{Model, RoleLine, Series};
+use crate::late::{LastLate, LateKind, LateStatus};
 use crate::sample::RoleState;
 use ratatui::backend::TestBackend;
 use ratatui::layout::{Constraint, Layout, Rect};
@@ -38,17 +39,21 @@ pub fn draw(model: &Model, frame: &mut Frame<'_>) {
         return;
     }
     let roles = (model.roles.len() as u16).min(ROLES + area.height.saturating_sub(USUAL_HEIGHT) / 2);
+    let late = late_line(model, usize::from(area.width));
+    // It has the place of one event.
+    let (late_height, events_min) = if late.is_some() { (1, EVENTS_MIN - 1) } else { (0, EVENTS_MIN) };
+    let roles_height = 1 + roles + late_height;
     // A sparkline has two lines if they fit.
-    let fixed = 1 + (1 + roles) + 1 + (1 + EVENTS_MIN) + (1 + FIELDS_MIN) + 1;
+    let fixed = 1 + roles_height + 1 + (1 + events_min) + (1 + FIELDS_MIN) + 1;
     let series = model.series.len() as u16;
     let lines = if area.height >= fixed + 2 * series { 2 } else { 1 };
     // Events get the lines that the fields of the selected signal do not need.
-    let fixed = 1 + (1 + roles) + (1 + lines * series) + 1;
+    let fixed = 1 + roles_height + (1 + lines * series) + 1;
     let fields = model.signals.get(model.selected).map_or(0, |signal| signal.fields.len() as u16).max(FIELDS_MIN);
-    let events = area.height.saturating_sub(fixed + 1 + fields).max(1 + EVENTS_MIN);
+    let events = area.height.saturating_sub(fixed + 1 + fields).max(1 + events_min);
     let [head, role_area, series_area, event_area, signal_area, foot] = Layout::vertical([
         Constraint::Length(1),
-        Constraint::Length(1 + roles),
+        Constraint::Length(roles_height),
         Constraint::Length(1 + lines * series),
         Constraint::Length(events),
         Constraint::Min(2),
@@ -56,7 +61,8 @@ pub fn draw(model: &Model, frame: &mut Frame<'_>) {
     ])
     .areas(area);
     frame.render_widget(header(model), head);
-    frame.render_widget(Paragraph::new(role_lines(model, usize::from(roles))), role_area);
+    let role_lines = role_lines(model, usize::from(roles)).into_iter().chain(late);
+    frame.render_widget(Paragraph::new(role_lines.collect::<Vec<_>>()), role_area);
     let series_area = section("errors, log scale, largest value per column", series_area, frame);
     draw_series(model, lines, frame, series_area);
     draw_events(model, frame, event_area);
@@ -134,6 +140,21 @@ fn role_line(role: &RoleLine) -> Line<'static> {
         Span::styled(format!("{:>6} ", role.missed), alarmed(role.missed > 0)),
         Span::raw(format!("{:>13} {:>13}", percentiles(&role.lateness), percentiles(&role.step))),
     ])
+}
+
+/// Returns the number of late ticks, and the last one with its cause; `None` before the first.
+fn late_line(model: &Model, width: usize) -> Option<Line<'static>> {
+    let LateStatus { count, last, only_counted } = model.late.as_ref()?;
+    let LastLate { role, tick, kind, late_us, cause } = last.as_ref()?;
+    let which = if *only_counted { "last kept" } else { "last" };
+    let kind = match kind {
+        LateKind::Late => "",
+        LateKind::Missed => "missed ",
+        LateKind::Starved => "starved ",
+    };
+    let cause = cause.as_deref().unwrap_or("unknown cause");
+    let text = format!("{count} late ticks, {which}: {role} {kind}{tick}, {} us: {cause}", short(*late_us));
+    Some(Line::raw(cut(&text, width)))
 }
 
 /// Formats a number of µs in few columns.
@@ -272,6 +293,41 @@ mod tests {
         }
         assert_eq!(text.lines().count(), 24);
         assert!(text.lines().all(|line| line.chars().count() <= 80));
+    }
+
+    #[test]
+    fn the_last_late_tick_has_a_line_with_its_cause() {
+        let last = |kind, cause: Option<&str>| {
+            let cause = cause.map(str::to_owned);
+            Some(LastLate { role: "controller".to_owned(), tick: 4711, kind, late_us: 812.4, cause })
+        };
+        let hog = "task \"hog\" (thread 12, real-time priority 95)";
+        let long = "x".repeat(200);
+        for (status, line) in [
+            (LateStatus::default(), None),
+            (
+                LateStatus { count: 3, last: last(LateKind::Late, Some(hog)), only_counted: false },
+                Some(format!("3 late ticks, last: controller 4711, 812 us: {hog}")),
+            ),
+            (
+                LateStatus { count: 9999, last: last(LateKind::Missed, None), only_counted: true },
+                Some("9999 late ticks, last kept: controller missed 4711, 812 us: unknown cause".to_owned()),
+            ),
+            (
+                LateStatus { count: 3, last: last(LateKind::Starved, Some(&long)), only_counted: false },
+                Some("3 late ticks, last: controller starved 4711, 812 us: xxxxxxxxxxxxxxxxxxxxxxxxx..".to_owned()),
+            ),
+        ] {
+            let model = Model { late: Some(status), ..model() };
+            let text = text(&model, 80, 24);
+            let shown = text.lines().find(|line| line.contains("late ticks")).map(|line| cut(line, 80));
+            assert_eq!(shown, line.map(|line| cut(&line, 80)), "{text}");
+            for word in ["1200  leader restarted", " omega_rad_s ", "q quit"] {
+                assert!(text.contains(word), "{word}\n{text}");
+            }
+            // The errors still have two lines each.
+            assert_eq!(text.lines().filter(|line| line.starts_with("1.080e-10")).count(), 1, "{text}");
+        }
     }
 
     /// Only the fields of the marked signal are shown, and their lines contain no signal name.

@@ -9,6 +9,7 @@ use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
+use crate::late::LateFollower;
 use crate::runtime::{depths, join_at_low_priority, topic, with_realtime_priority};
 use crate::sample::{Phase, Schedule};
 use crate::scenario::Scenario;
@@ -33,6 +34,7 @@ pub struct Session {
 struct Joined {
     feed: Feed,
     schedule: <IoxBus as Bus>::Reader<Schedule>,
+    late: Option<LateFollower>,
     _bus: IoxBus,
 }
 
@@ -46,7 +48,7 @@ impl Joined {
         let bus = retry(&may_wait, || IoxBus::join(domain, "watch", depths(scenario)))?;
         let feed = retry(&may_wait, || Feed::open(scenario, &bus, model))?;
         let schedule = bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?;
-        Ok(Self { feed, schedule, _bus: bus })
+        Ok(Self { feed, schedule, late: LateFollower::open(domain, scenario), _bus: bus })
     }
 }
 
@@ -79,12 +81,13 @@ impl Session {
     /// # Errors
     /// [`WatchError::Bus`].
     pub fn poll(&mut self) -> Result<(), WatchError> {
-        let Some(Joined { feed, schedule, .. }) = &mut self.joined else { return Ok(()) };
+        let Some(Joined { feed, schedule, late, .. }) = &mut self.joined else { return Ok(()) };
         while schedule.advance()? {}
         let current = schedule.current().copied().unwrap_or_default();
         let phase = Phase::from_number(current.phase);
         let grid = Grid { epoch_ns: current.epoch_ns, period_ns: self.scenario.period_ns };
         feed.poll((phase >= Phase::Run).then_some(grid), &mut self.model)?;
+        self.model.late = late.as_mut().map(|late| late.poll(&self.scenario).clone());
         if phase == Phase::Stop || !self.domain.exists() {
             self.leave();
         }

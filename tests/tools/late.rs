@@ -1,6 +1,6 @@
 //! `corotate why` and the report of a run with late ticks: selection, and refused input.
 
-use crate::common::{Bench, Done, summary_in};
+use crate::common::{Bench, Done, rewrite_metadata, summary_in};
 use serde_json::{Value, json};
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -34,13 +34,13 @@ fn late_report(run: &Value) -> Value {
     ]);
     json!({
         "schema": "corotate/late/v1", "run": run, "scenario": "rigid-pair", "period_us": 1000.0, "late_us": 100.0,
-        "source": "kernel", "counted": 5,
+        "source": "kernel", "counted": 5, "examined": 5,
         "ticks": [late("follower", 300, 3, "missed", 2900.0, json!([])), leader, controller],
         "causes": [
             { "cause": "late input from leader", "kind": "input", "name": "leader", "ticks": 1, "worst_us": 900.0, "sum_us": 900.0 },
             { "cause": "task \"hog\"", "kind": "task", "name": "hog", "ticks": 1, "worst_us": 890.0, "sum_us": 890.0 },
         ],
-        "patterns": [{ "period_ms": 100.0, "ticks": 2, "of": 3, "hint": "a quota" }],
+        "patterns": [{ "cause": "task \"hog\"", "period_ms": 100.0, "ticks": 2, "compared": 3, "hint": "a quota" }],
     })
 }
 
@@ -163,6 +163,104 @@ fn a_trace_has_late_ticks_cores_and_samples_on_one_axis() {
     assert!(refused.code == Some(2) && refused.codes() == ["same-file"], "{refused:?}");
     let refused = why(&bench, &["--perfetto", "no/such/file"]);
     assert!(refused.code == Some(1) && refused.codes() == ["cannot-write"], "{refused:?}");
+}
+
+/// The file is emptied before the run, so that an older trace is not taken for that of a killed run.
+#[test]
+fn a_run_writes_its_trace() {
+    let bench = Bench::new();
+    let run = |options: &[&str]| {
+        let common = ["run", "rigid-pair", "--duration", "0.5", "--set", "accept={}", "--out", "run", "--overwrite"];
+        bench.run(&[&common[..], options].concat())
+    };
+    let done = run(&[
+        "--clock",
+        "realtime",
+        "--set",
+        "realtime.late_us=0",
+        "--trace-out",
+        "new/trace.json",
+        "--junit",
+        "verdict.xml",
+    ])
+    .succeeded();
+    assert!(done.stderr.contains("new/trace.json: open it at https://ui.perfetto.dev"), "{done:?}");
+    let trace: Value = serde_json::from_slice(&fs::read(bench.path("new/trace.json")).unwrap()).unwrap();
+    let events = trace["traceEvents"].as_array().unwrap();
+    let late = events.iter().filter(|event| event["args"]["about"].is_string()).count();
+    assert!(late > 100, "every tick is late: {late}");
+    let (verdict, summary) = (fs::read_to_string(bench.path("verdict.xml")).unwrap(), summary_in(&bench.path("run")));
+    for (name, value) in [("late_ticks", &summary["late"]["counted"]), ("late_source", &summary["late"]["source"])] {
+        let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+        assert!(verdict.contains(&format!("<property name=\"{name}\" value=\"{value}\"/>")), "{verdict}");
+    }
+
+    for options in [&["--clock", "lockstep"][..], &["--clock", "realtime", "--set", "realtime.trace=\"off\""]] {
+        let refused = run(&[options, &["--trace-out", "other.json"]].concat());
+        assert!(refused.code == Some(2) && refused.codes() == ["no-late-ticks"], "{refused:?}");
+        assert!(!bench.path("other.json").exists());
+    }
+    fs::write(bench.path("taken"), "").unwrap();
+    let refused = run(&["--clock", "realtime", "--trace-out", "taken/trace.json"]);
+    assert!(refused.code == Some(1) && refused.codes() == ["cannot-write"], "{refused:?}");
+    let refused = run(&["--clock", "realtime", "--trace-out", "run/summary.json"]);
+    assert!(refused.code == Some(2) && refused.codes() == ["same-file"], "{refused:?}");
+    assert_eq!(summary_in(&bench.path("run"))["clock"], "realtime", "the result is kept");
+}
+
+/// A recording that was copied to another place has the late ticks of its run, with the same causes and totals.
+#[test]
+fn a_recording_alone_has_the_late_ticks() {
+    let bench = Bench::new();
+    let common = ["run", "rigid-pair", "--clock", "realtime", "--duration", "1", "--set", "accept={}"];
+    // Every tick is late, and the recording has a part of them.
+    let options = ["--set", "realtime.late_us=0", "--record", "--out", "run"];
+    bench.run(&[&common[..], &options].concat()).succeeded();
+    fs::create_dir(bench.path("elsewhere")).unwrap();
+    fs::copy(bench.path("run/run.mcap"), bench.path("elsewhere/run.mcap")).unwrap();
+    let report: Value = serde_json::from_slice(&fs::read(bench.path("run/late.json")).unwrap()).unwrap();
+    let late = report["ticks"].as_array().unwrap();
+    assert!(late.len() > 2000, "{}", late.len());
+    for source in ["elsewhere", "elsewhere/run.mcap"] {
+        let object = bench.run(&["why", source, "--json", "-n", "100000"]).succeeded().json();
+        for key in ["run", "scenario", "source", "note", "counted", "examined", "causes", "patterns"] {
+            assert_eq!(object[key], report[key], "{key}");
+        }
+        let ticks = object["ticks"].as_array().unwrap();
+        assert_eq!(ticks.len(), 1000);
+        for tick in ticks {
+            let key = |value: &Value| (value["role"].clone(), value["tick"].clone());
+            let same = late.iter().find(|late| key(late) == key(tick)).unwrap();
+            assert_eq!((&tick["late_us"], &tick["causes"]), (&same["late_us"], &same["causes"]));
+        }
+        let least = ticks.iter().map(|late| late["late_us"].as_f64().unwrap()).fold(f64::INFINITY, f64::min);
+        assert!(late.iter().filter(|late| late["late_us"].as_f64().unwrap() > least).count() < 1000);
+        let text = bench.run(&["why", source]).succeeded().stdout;
+        assert!(text.contains("short ones left out of this file"), "{text}");
+        bench.run(&["report", source, "--out", "page.html"]).succeeded();
+        assert!(fs::read_to_string(bench.path("page.html")).unwrap().contains("<section id=\"late\">"));
+    }
+    let refused = bench.run(&["why", "elsewhere/run.mcap", "--role", "x"]);
+    assert!(refused.codes() == ["unknown-role"] && refused.stderr.contains("controller"), "{refused:?}");
+    bench.run(&["why", "elsewhere/run.mcap", "--perfetto", "trace.json"]).succeeded();
+    let trace: Value = serde_json::from_slice(&fs::read(bench.path("trace.json")).unwrap()).unwrap();
+    assert!(trace["traceEvents"].as_array().unwrap().iter().filter(|event| event["ph"] == "i").count() > 4 * 800);
+
+    // A changed letter of the late ticks is a damage, and other commands do not read them.
+    let bytes = fs::read(bench.path("run/run.mcap")).unwrap();
+    let at = bytes.windows(16).position(|part| part == b"corotate/late/v1").unwrap();
+    let damaged = [&bytes[..at + 9], b"L", &bytes[at + 10..]].concat();
+    fs::write(bench.path("damaged.mcap"), damaged).unwrap();
+    let refused = bench.run(&["why", "damaged.mcap"]);
+    assert!(refused.code == Some(1) && refused.codes() == ["damaged-recording"], "{refused:?}");
+    rewrite_metadata(&bench.path("run/run.mcap"), &bench.path("other.mcap"), |name, entries| {
+        if name == "corotate.late" {
+            entries.insert("report".to_owned(), "{}".to_owned());
+        }
+    });
+    bench.run(&["diff", "run/run.mcap", "other.mcap"]).succeeded();
+    let refused = bench.run(&["why", "other.mcap"]);
+    assert!(refused.code == Some(2) && refused.codes() == ["unreadable-late-ticks"], "{refused:?}");
 }
 
 #[test]

@@ -321,3 +321,31 @@ fn arguments(pid: u32) -> Vec<String> {
 fn maps(pid: u32) -> String {
     std::fs::read_to_string(format!("/proc/{pid}/maps")).unwrap_or_default()
 }
+
+/// With the kernel's trace the tracing process names the cause, without it the counters tell its kind.
+#[test]
+fn the_screen_shows_the_last_late_tick() {
+    let bench = Bench::new();
+    // Every tick is late.
+    let late = ["--clock", "realtime", "--set", "realtime.late_us=0"];
+    for trace in ["auto", "counters"] {
+        let run = bench.start(&[&RUN[..], &late, &["--set", &format!("realtime.trace=\"{trace}\"")]].concat());
+        bench.await_ticks("controller");
+        let object = bench.run(&["watch", "--once", "2", "--json"]).succeeded().json();
+        let (late, last) = (&object["late"], &object["late"]["last"]);
+        assert!(late["count"].as_u64().unwrap() > 100 && late["only_counted"].is_boolean(), "{late}");
+        assert!(last["tick"].as_u64().unwrap() > 50 && last["late_us"].as_f64().unwrap() > 0.0, "{late}");
+        assert!(last["role"].is_string() && last["kind"].is_string() && last.get("cause").is_some(), "{late}");
+        let screen = bench.run(&["watch", "--once", "0.5"]).succeeded().stdout;
+        let line =
+            screen.lines().find(|line| line.contains(" late ticks, last: ")).unwrap_or_else(|| panic!("{screen}"));
+        assert!(line.contains(" us: "), "{line}");
+        run.signal(SIGTERM);
+        assert_eq!(run.wait().code, Some(143));
+    }
+    let run = bench.start(&[&RUN[..], &["--clock", "lockstep"]].concat());
+    bench.await_ticks("controller");
+    assert!(bench.run(&["watch", "--once", "0.5", "--json"]).succeeded().json()["late"].is_null());
+    run.signal(SIGTERM);
+    run.wait();
+}
