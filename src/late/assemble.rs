@@ -2,7 +2,7 @@
 
 use super::counters;
 use super::delay::Delay;
-use super::tracer::{Finding, Findings};
+use super::findings::{Finding, Findings};
 use super::{Cause, CauseKind, CauseTotal, LateKind, LateReport, LateTick, Pattern, SCHEMA, Source, TickOfRole};
 use crate::runtime::RoleId;
 use crate::scenario::Scenario;

@@ -4,7 +4,7 @@
 
 use super::assemble::{late_tick, replace_input};
 use super::delay::Delay;
-use super::tracer::Finding;
+use super::findings::Finding;
 use super::{CauseKind, LateKind};
 use crate::bus::domain::Domain;
 use crate::runtime::{RoleId, late_log};

@@ -6,6 +6,7 @@
 //! | `delay` | the length and the parts of one delay |
 //! | `counters` | causes from the counters of a role's thread: their kinds |
 //! | `explain` | causes from the kernel's events: their names |
+//! | `findings` | the findings of the tracing process, and their file |
 //! | `ring` | the last seconds of the kernel's trace, undecoded |
 //! | `last` | the last late tick of a running loop |
 //! | `tracer` | the process that records the kernel's trace beside a run |
@@ -17,6 +18,7 @@ mod assemble;
 mod counters;
 mod delay;
 mod explain;
+mod findings;
 mod last;
 mod model;
 mod perfetto;
@@ -28,6 +30,7 @@ pub use assemble::report;
 pub use corotate_trace::{Cause, CauseKind};
 pub(crate) use counters::causes as causes_by_counters;
 pub(crate) use delay::Delay;
+pub use findings::{Findings, TRACER, await_findings, findings, ready_path, trace_refusal, wants_trace};
 pub use last::{LastLate, LateFollower, LateStatus};
 pub use model::{
     CauseTotal, Chain, LateKind, LateReport, LateTick, Pattern, SCHEMA, Slice, SliceKind, Source, TickOfRole,
@@ -35,7 +38,7 @@ pub use model::{
 };
 pub use perfetto::{Perfetto, SampleMark};
 pub use ring::{TraceRing, remove_dead_traces};
-pub use tracer::{Findings, TRACER, await_findings, findings, ready_path, run_tracer, trace_refusal, wants_trace};
+pub use tracer::run_tracer;
 pub use words::late_table;
 pub(crate) use words::{ASCII_US, cause_rows, header, listing, pattern, sentence, us};
 

@@ -3,28 +3,23 @@
 //! It keeps the last seconds of the trace undecoded and decodes the time around a late tick only. Must not delay a role, nor end a run:
 //! without a trace the roles' counters tell the kind of each cause.
 
+use super::Cause;
 use super::delay::Delay;
 use super::explain::{causes, input_causes, slices};
+use super::findings::{Finding, Findings, TRACER, ready_path};
 use super::last::{Candidate, last_path};
 use super::ring::{KEPT_NS, TraceRing};
-use super::{Cause, Slice, TracerCost};
 use crate::bus::domain::Domain;
 use crate::clock::{monotonic_ns, sleep_until};
-use crate::config::{ClockKind, Trace};
 use crate::runtime::{RoleId, late_log};
 use crate::scenario::Scenario;
 use crate::seat::{RoleError, join_complete, open_ledger, report_path, write_whole};
 use crate::system::name_thread;
 use crate::telemetry::LateLog;
-use corotate_trace::{TraceError, require_tracefs};
-use serde::{Deserialize, Serialize};
+use corotate_trace::TraceError;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// The name of the process.
-pub const TRACER: &str = "tracer";
-/// The longest wait of another process for the findings, ns.
-const FINDINGS_NS: u64 = 2_000_000_000;
 /// Interval between two looks at the trace and at the records of late ticks, ns.
 const POLL_NS: u64 = 20_000_000;
 /// Least time between two publications of the last late tick, ns.
@@ -34,74 +29,6 @@ const TIMELINES: usize = 10;
 /// The number of events that are decoded at each look, about: more would cost a core. At the end it is larger.
 const DECODED: u64 = 50_000;
 const DECODED_LAST: u64 = 5_000_000;
-
-/// Findings of the process.
-#[derive(Debug, Default, Serialize, Deserialize)]
-pub struct Findings {
-    /// The reason for which there is no trace, with the remedy.
-    pub note: Option<String>,
-    /// The explained late ticks.
-    pub ticks: Vec<Finding>,
-    /// The costs of the process.
-    pub cost: Option<TracerCost>,
-}
-
-/// The causes of one late tick.
-#[derive(Debug, Serialize, Deserialize)]
-pub struct Finding {
-    /// The role, as [`RoleId::number`].
-    pub role: u64,
-    /// The index of its record.
-    pub index: usize,
-    /// The length of the delay, ns.
-    pub delay_ns: u64,
-    /// The causes.
-    pub causes: Vec<Cause>,
-    /// Causes that kept the sender of its last input from sending it, for a sender without a late tick of its own.
-    pub input_causes: Vec<Cause>,
-    /// The cores around it, if it is one of the worst ticks.
-    pub slices: Vec<Slice>,
-}
-
-/// Returns the file that the process writes once the trace runs, or cannot run.
-pub fn ready_path(domain: &Domain) -> PathBuf {
-    domain.root().join("tracer.ready")
-}
-
-/// Returns the findings of the process in a domain.
-pub fn findings(domain: &Domain) -> Option<Findings> {
-    serde_json::from_slice(&std::fs::read(report_path(domain.root(), TRACER)).ok()?).ok()
-}
-
-/// Returns true if a scenario asks for the kernel's trace.
-pub fn wants_trace(scenario: &Scenario) -> bool {
-    scenario.clock == ClockKind::Realtime && matches!(scenario.realtime.trace, Trace::Auto | Trace::Kernel)
-}
-
-/// Returns the reason for which this process could not trace a run of a scenario that asks for it; `None` if it could.
-pub fn trace_refusal(scenario: &Scenario) -> Option<String> {
-    require_tracefs().err().filter(|_| wants_trace(scenario)).map(|error| error.to_string())
-}
-
-/// Waits until the process of a stopped run has written its findings. Returns them, or the reason why there are none. Does not wait if
-/// the run has no such process.
-pub fn await_findings(
-    domain: &Domain,
-    scenario: &Scenario,
-    may_wait: impl Fn() -> bool,
-) -> Result<Findings, Option<String>> {
-    if !ready_path(domain).exists() {
-        return Err(trace_refusal(scenario));
-    }
-    let end_ns = monotonic_ns() + FINDINGS_NS;
-    loop {
-        match findings(domain) {
-            Some(findings) => return Ok(findings),
-            None if monotonic_ns() < end_ns && may_wait() => sleep_until(monotonic_ns() + POLL_NS / 4),
-            None => return Err(Some("the tracing process left no findings in time".to_owned())),
-        }
-    }
-}
 
 /// Traces a run until `terminated`, and writes what it found to the domain.
 ///
