@@ -236,3 +236,94 @@ fn patterns(report: &LateReport) -> Vec<Pattern> {
     });
     found.collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::SHIPPED;
+    use crate::telemetry::LateRecord;
+
+    const MS: u64 = 1_000_000;
+
+    fn scenario() -> Scenario {
+        let (name, text) = SHIPPED[0];
+        Scenario::parse(text, name, &["clock=realtime", "tick_hz=1000", "accept={}"].map(str::to_owned)).unwrap()
+    }
+
+    /// A record of a tick that ended `us` late.
+    fn record(tick: u64, us: u64, sender: u64, input_us: u64) -> LateRecord {
+        let due_ns = 7 * MS + tick * MS;
+        let (input_ns, done_ns) = (due_ns + input_us * 1000, due_ns + us * 1000);
+        LateRecord { tick, sender, due_ns, input_ns, began_ns: done_ns, done_ns, slept: true, ..LateRecord::default() }
+    }
+
+    fn of_roles(late: [(&str, Vec<LateRecord>); 3]) -> LateReport {
+        let reports = late.map(|(role, late_ticks)| {
+            let report: serde_json::Value = serde_json::json!({
+                "role": role, "written": [], "read": [], "line": null, "late_ticks": late_ticks,
+                "ticks": { "elapsed": 100, "executed": 100, "missed": 0, "late": late_ticks.len(), "first_disturbed": null },
+            });
+            serde_json::from_value(report).unwrap()
+        });
+        report(&scenario(), &reports, None, Some("no trace".to_owned())).unwrap()
+    }
+
+    #[test]
+    fn a_late_input_leads_to_the_sender_and_its_cause() {
+        let (leader, observer) = (RoleId::Plant(0).number(), RoleId::Observer.number());
+        let report = of_roles([
+            ("leader", vec![record(5, 800, 0, 0)]),
+            ("observer", vec![record(5, 803, leader, 801)]),
+            ("controller", vec![record(5, 810, observer, 804), record(9, 400, observer, 390)]),
+        ]);
+        assert_eq!((report.counted, report.examined, report.epoch_ns), (4, 4, 7 * MS));
+        let late = report.find("controller", 5).unwrap();
+        assert_eq!(late.caused_by, Some(TickOfRole { role: "observer".to_owned(), tick: 5 }));
+        assert_eq!(
+            (late.causes[0].kind, &*late.causes[0].name, late.causes[0].us),
+            (CauseKind::Input, "observer", 804.0)
+        );
+        let roots = report.root_causes(late);
+        assert!(roots.iter().all(|root| root.kind != CauseKind::Input), "{roots:?}");
+        assert_eq!(roots[0].kind, CauseKind::LateTimer);
+        let sum: f64 = roots.iter().map(|root| root.us).sum();
+        assert!(sum <= late.late_us, "{roots:?}");
+        // The observer was not late itself at tick 9, so the input stays the cause.
+        let alone = report.find("controller", 9).unwrap();
+        assert_eq!((alone.caused_by.clone(), alone.causes[0].kind), (None, CauseKind::Input));
+        let total = report.causes.iter().find(|total| total.kind == CauseKind::LateTimer).unwrap();
+        assert_eq!((total.ticks, total.worst_us), (3, 800.0));
+    }
+
+    #[test]
+    fn a_starved_body_leads_to_the_tick_of_its_command() {
+        let missed = LateRecord { missed: 3, ..record(4, 3200, RoleId::Observer.number(), 0) };
+        let starved = LateRecord { starved: true, sender: RoleId::Controller.number(), ..record(6, 0, 0, 0) };
+        let report = of_roles([("leader", vec![]), ("controller", vec![missed]), ("follower", vec![starved])]);
+        let late = report.find("follower", 6).unwrap();
+        assert_eq!((late.kind, late.late_us), (LateKind::Starved, 1000.0), "the command is at least a period late");
+        assert_eq!(late.caused_by, Some(TickOfRole { role: "controller".to_owned(), tick: 4 }));
+        assert_eq!(report.find("controller", 6).map(|late| (late.tick, late.ticks)), Some((4, 3)));
+    }
+
+    #[test]
+    fn senders_that_blame_each_other_end_the_search() {
+        let (leader, observer) = (RoleId::Plant(0).number(), RoleId::Observer.number());
+        let report = of_roles([
+            ("leader", vec![record(5, 800, observer, 790)]),
+            ("observer", vec![record(5, 800, leader, 790)]),
+            ("controller", vec![]),
+        ]);
+        let roots = report.root_causes(report.find("leader", 5).unwrap());
+        assert!(roots.iter().map(|root| root.us).sum::<f64>() <= 800.0 && !roots.is_empty());
+    }
+
+    #[test]
+    fn a_run_without_records_has_no_report() {
+        let (name, text) = SHIPPED[0];
+        for overrides in [["clock=lockstep", "accept={}"], ["clock=realtime", "realtime.trace=\"off\""]] {
+            let scenario = Scenario::parse(text, name, &overrides.map(str::to_owned)).unwrap();
+            assert!(report(&scenario, &[], None, None).is_none(), "{overrides:?}");
+        }
+    }
+}

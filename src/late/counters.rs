@@ -74,3 +74,71 @@ pub fn causes(delay: &Delay) -> Vec<Cause> {
     rest.add(CauseKind::Step, computed_ns);
     rest.causes
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::runtime::RoleId;
+    use crate::telemetry::Usage;
+
+    const US: u64 = 1000;
+
+    /// A body that looks at the clock 900 µs late, with these counters.
+    fn body(record: LateRecord) -> Vec<(CauseKind, f64)> {
+        let instants = LateRecord { due_ns: 1000 * US, began_ns: 1900 * US, done_ns: 1900 * US, ..record };
+        of_role(RoleId::Plant(0), instants)
+    }
+
+    fn of_role(role: RoleId, record: LateRecord) -> Vec<(CauseKind, f64)> {
+        let delay = Delay { role, record, period_ns: 1000 * US };
+        let causes = causes(&delay);
+        let sum: f64 = causes.iter().map(|cause| cause.us).sum();
+        assert!(sum <= (delay.ns() - delay.input_ns()) as f64 / 1e3, "{causes:?}");
+        causes.into_iter().map(|cause| (cause.kind, cause.us)).collect()
+    }
+
+    fn usage(usage: Usage) -> LateRecord {
+        LateRecord { usage, slept: true, ..LateRecord::default() }
+    }
+
+    #[test]
+    fn each_counter_explains_its_part_of_a_delay() {
+        let run_delay_ns = 700 * US;
+        assert_eq!(
+            body(usage(Usage { run_delay_ns, ..Usage::default() })),
+            [(CauseKind::Task, 700.0), (CauseKind::LateTimer, 200.0)]
+        );
+        // A stopped task waits for its core too.
+        let (run_delay_ns, throttled_ns) = (80_000 * US, 80_000 * US);
+        let quota = usage(Usage { run_delay_ns, throttled_ns, ..Usage::default() });
+        assert_eq!(body(quota), [(CauseKind::Throttled, 900.0)]);
+        assert_eq!(body(LateRecord { continued: true, ..usage(Usage::default()) }), [(CauseKind::Stopped, 900.0)]);
+        let stalled = LateRecord { stalled: true, ..usage(Usage { run_delay_ns: 900 * US, ..Usage::default() }) };
+        assert_eq!(body(stalled), [(CauseKind::Fault, 900.0)]);
+        let gap = LateRecord { gap_ns: 940 * US, gap_end_ns: 1899 * US, ..usage(Usage::default()) };
+        assert_eq!(body(gap), [(CauseKind::CoreTaken, 899.0)]);
+        assert_eq!(body(LateRecord::default()), [(CauseKind::Step, 900.0)], "it was busy with the tick before");
+        assert_eq!(body(usage(Usage::default())), [(CauseKind::LateTimer, 900.0)]);
+    }
+
+    #[test]
+    fn a_computation_is_told_from_page_faults_in_it_and_from_its_input() {
+        let record = |usage| LateRecord {
+            sender: RoleId::Plant(0).number(),
+            due_ns: 1000 * US,
+            input_ns: 1100 * US,
+            began_ns: 1103 * US,
+            done_ns: 1500 * US,
+            usage,
+            ..LateRecord::default()
+        };
+        let of_observer = |usage| of_role(RoleId::Observer, record(usage));
+        assert_eq!(of_observer(Usage::default()), [(CauseKind::Step, 397.0)]);
+        let minor_faults = 200;
+        assert_eq!(of_observer(Usage { minor_faults, ..Usage::default() }), [(CauseKind::PageFault, 397.0)]);
+        let few = Usage { minor_faults: 20, ..Usage::default() };
+        assert_eq!(of_observer(few), [(CauseKind::Step, 397.0)], "20 faults take 80 us");
+        let starved = LateRecord { starved: true, ..record(Usage::default()) };
+        assert_eq!(of_role(RoleId::Observer, starved), []);
+    }
+}
