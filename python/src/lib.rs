@@ -17,6 +17,7 @@ fn _corotate(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(run::main, module)?)?;
     module.add_function(wrap_pyfunction!(run::started_by, module)?)?;
     module.add_function(wrap_pyfunction!(run::run, module)?)?;
+    module.add_function(wrap_pyfunction!(run::late_ticks, module)?)?;
     module.add_function(wrap_pyfunction!(run::certificate, module)?)?;
     module.add_function(wrap_pyfunction!(run::shipped, module)?)?;
     module.add_function(wrap_pyfunction!(seat::describe, module)?)?;

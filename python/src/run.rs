@@ -2,6 +2,7 @@
 
 use corotate::Program;
 use corotate::config::{RunId, SHIPPED};
+use corotate::late::{LateReport, LateTick};
 use corotate::launch::{
     Launch, Outcome, Progress, Summary, claim, make_directory, make_latest, new_run, run as launch, write_run,
 };
@@ -11,6 +12,7 @@ use pyo3::create_exception;
 use pyo3::exceptions::{PyException, PyValueError};
 use pyo3::prelude::*;
 use std::fmt::Display;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::SystemTime;
@@ -131,12 +133,38 @@ pub fn run(
         // Results are written before what is left of the run is put away.
         let outcome: Outcome = launch(&scenario, launched).map_err(failed)?;
         let summary = Summary::new(&scenario, &outcome, started);
-        write_run(&directory, &scenario, &summary).map_err(failed)?;
+        write_run(&directory, &scenario, &summary, outcome.late.as_ref()).map_err(failed)?;
         let _ = make_latest(&directory);
         serde_json::to_string(&summary).map_err(failed)
     });
     // The exception of the progress function comes before the failures that follow from it.
     raised.map_or(ended, Err).map(|summary| (summary, directory))
+}
+
+/// Returns the late ticks of the run in a directory as a list in JSON, each cause with its `words`; `None` without a `late.json`.
+#[pyfunction]
+pub fn late_ticks(py: Python<'_>, directory: PathBuf) -> PyResult<Option<String>> {
+    py.detach(|| {
+        let path = directory.join("late.json");
+        let bytes = match std::fs::read(&path) {
+            Ok(bytes) => bytes,
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(failed(format!("cannot read {}: {error}", path.display()))),
+        };
+        let report = LateReport::parse(&bytes);
+        let report = report.map_err(|reason| failed(format!("cannot read {}: {reason}", path.display())))?;
+        let ticks = report.ticks.iter().map(tick_with_words).collect::<Result<Vec<_>, _>>().map_err(failed)?;
+        serde_json::to_string(&ticks).map(Some).map_err(failed)
+    })
+}
+
+/// Returns a late tick whose causes are also in words.
+fn tick_with_words(late: &LateTick) -> serde_json::Result<serde_json::Value> {
+    let mut tick = serde_json::to_value(late)?;
+    for (cause, known) in tick["causes"].as_array_mut().into_iter().flatten().zip(&late.causes) {
+        cause["words"] = known.to_string().into();
+    }
+    Ok(tick)
 }
 
 /// Returns the convergence claims of a scenario's loop as JSON: one entry per driven body.

@@ -192,7 +192,7 @@ impl Steps {
         let summary = Summary::new(&self.scenario, &outcome, self.started);
         let directory = match self.results.take() {
             Some((directory, _claim)) => {
-                write_run(&directory, &self.scenario, &summary).map_err(failed)?;
+                write_run(&directory, &self.scenario, &summary, outcome.late.as_ref()).map_err(failed)?;
                 let _ = make_latest(&directory);
                 Some(directory)
             }

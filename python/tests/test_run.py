@@ -41,6 +41,25 @@ def test_a_controller_in_python_has_the_bits_of_the_built_in_controller(tmp_path
     assert stepped.metrics["sync_error_rad_s"]["last"] == built_in.metrics["sync_error_rad_s"]["last"]
 
 
+def test_a_run_in_real_time_has_late_ticks(tmp_path):
+    # Every tick is late.
+    run = corotate.run("rigid-pair", clock="realtime", set={**SHORT, "duration_s": 1, "realtime.late_us": 0}, out=tmp_path / "late")
+    assert run.summary["late"]["examined"] == sum(late["ticks"] for late in run.late) > 100
+    assert {late["role"] for late in run.late} <= {"leader", "observer", "controller", "follower"}
+    times = [late["time_s"] for late in run.late]
+    assert times == sorted(times)
+    for late in run.late:
+        assert late["kind"] in ("late", "missed", "starved") and late["time_s"] == pytest.approx(late["tick"] / 1000)
+        assert sum(cause["us"] for cause in late["causes"]) <= late["late_us"] * 1.001
+        assert all(cause["kind"] and cause["words"] for cause in late["causes"])
+    worst = max(run.late, key=lambda late: late["late_us"])
+    assert worst["late_us"] == run.summary["late"]["ticks"][0]["late_us"]
+
+    off = corotate.run("rigid-pair", clock="realtime", set={**SHORT, "duration_s": 0.5, "realtime.trace": "off"}, out=tmp_path / "off")
+    lockstep = corotate.run("rigid-pair", clock="lockstep", set={**SHORT, "duration_s": 0.5}, out=tmp_path / "lockstep")
+    assert off.late is None and lockstep.late is None
+
+
 def test_an_observer_and_a_body_can_be_in_python(tmp_path):
     def observer(tick, inputs, outputs):
         # A constant guess of the hidden component.

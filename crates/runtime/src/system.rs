@@ -38,7 +38,7 @@ pub fn this_program() -> io::Result<Command> {
 
 /// Names the calling thread, for tools such as `ps` and for kernel traces: the first 15 bytes of a name.
 pub fn name_thread(name: &str) {
-    let end = name.floor_char_boundary(15);
+    let end = (0..=name.len().min(15)).rev().find(|end| name.is_char_boundary(*end)).unwrap_or_default();
     if let Ok(name) = CString::new(&name[..end]) {
         let _ = set_name(&name);
     }

@@ -45,6 +45,16 @@ class Run:
         return self.summary["state"]["hash"]
 
     @property
+    def late(self):
+        """The late ticks of a run in real time, in the order of time; None with another clock or with `realtime.trace = "off"`.
+
+        Each is a dict with the keys of `late.json`: `role`, `tick`, `ticks`, `kind`, `time_s`, `late_us`, `causes`, and `caused_by`
+        if another role's late tick caused it. Each cause is a dict with `kind`, `us`, `words`, and `name` where it is known.
+        """
+        found = _corotate.late_ticks(str(self.directory))
+        return None if found is None else json.loads(found)
+
+    @property
     def recording(self):
         """Its samples, if they were recorded."""
         path = self.directory / "run.mcap"
