@@ -5,13 +5,22 @@
 //! | `machine` | reads /proc, /sys and /dev below a root, and judges each value |
 //! | `cores` | the same for the cores of the roles |
 //! | `trial` | judges the roles' reports of a few seconds in real time |
+//! | `hunt` | measures the lateness of wakes on each core, and finds the causes of late ones |
+//! | `probe` | the thread on a core that wakes |
+//! | `hunt_report` | options and result of a hunt |
 //!
-//! Must not change the machine, nor start the run, and must not fail: a value that the system does not provide is unknown.
+//! Must not change the machine, apart from the trace instance of a hunt, nor start the run, and must not fail: a value that the
+//! system does not provide is unknown.
 
 mod cores;
+mod hunt;
+mod hunt_report;
 mod machine;
+mod probe;
 mod trial;
 
+pub use hunt::hunt;
+pub use hunt_report::{CoreLateness, HuntOptions, HuntReport};
 pub use machine::{Demand, Machine};
 pub use trial::Trial;
 

@@ -24,6 +24,8 @@ mod words;
 
 pub use assemble::report;
 pub use corotate_trace::{Cause, CauseKind};
+pub(crate) use counters::causes as causes_by_counters;
+pub(crate) use delay::Delay;
 pub use model::{
     CauseTotal, Chain, LateKind, LateReport, LateTick, Pattern, SCHEMA, Slice, SliceKind, Source, TickOfRole,
     TracerCost,

@@ -1,15 +1,16 @@
-//! `corotate doctor`: checks whether this machine is fit for real time, and prints remedies.
+//! `corotate doctor`: checks whether this machine is fit for real time, and prints remedies; or hunts for late wake-ups.
 
 use super::hosts::{self, KeyArguments};
-use super::output::{CommandResult, Exit, Failure, fail, say};
+use super::output::{CommandResult, Exit, Failure, fail, harmless, say};
 use super::scenario::{Change, load};
-use super::signals::catch_signals;
+use super::signals::{catch_signals, terminated_by_signals};
 use crate::bus::domain::{DomainError, domains, remove_dead_domains, scan_abandoned};
-use crate::doctor::{Check, Demand, Diagnosis, Machine, Trial, Verdict};
-use crate::doctor::{kernel_trace, left_in_shared_memory, leftovers, refused};
+use crate::doctor::{Check, Demand, Diagnosis, HuntOptions, Machine, Trial, Verdict};
+use crate::doctor::{hunt, kernel_trace, left_in_shared_memory, leftovers, refused};
 use crate::hosts::Address;
 use crate::late::remove_dead_traces;
 use crate::launch::{Launch, Progress, run};
+use crate::system::remedy;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
 
@@ -28,6 +29,24 @@ pub struct Arguments {
     /// Only measure the link to a run that waits for hosts, for --seconds
     #[arg(long, value_name = "ADDR")]
     link: Option<Address>,
+    /// Only measure how late each core wakes, for this duration in seconds, and
+    /// name the causes of late wakes
+    #[arg(
+        long,
+        value_name = "SECONDS",
+        value_parser = clap::value_parser!(u32).range(1..=86_400),
+        conflicts_with_all = ["file", "seconds", "clean", "link"]
+    )]
+    hunt: Option<u32>,
+    /// Wakes per second of --hunt
+    #[arg(
+        long,
+        value_name = "HZ",
+        default_value_t = 1000,
+        value_parser = clap::value_parser!(u32).range(10..=20_000),
+        requires = "hunt"
+    )]
+    rate: u32,
     #[command(flatten)]
     keys: KeyArguments,
     /// Print the report as one JSON object on stdout
@@ -36,7 +55,8 @@ pub struct Arguments {
 }
 
 const EXAMPLES: &str = "\
-Exit codes: 0 fit: no line is bad; 3 not fit: a line is bad
+Exit codes: 0 fit: no line is bad; 3 not fit: a line is bad; --hunt and --link
+do not judge
 
 The test run keeps cores, priorities and rate of the scenario, but has no
 faults, no criteria and no results; it starts external roles itself.
@@ -50,12 +70,17 @@ Examples:
   corotate doctor --link tcp/127.0.0.1:7447
                                    clock offset and round-trip times to the
                                    launching host
+  corotate doctor --hunt 60        wake-up lateness of each core for a minute,
+                                   before a bench is booked; best as root
   corotate doctor --clean --json   remove files of dead runs; print JSON";
 
 /// Examines the machine.
 pub fn doctor(arguments: &Arguments) -> CommandResult {
     if let Some(address) = &arguments.link {
         return hosts::probe(address, &arguments.keys, f64::from(arguments.seconds), arguments.json);
+    }
+    if let Some(seconds) = arguments.hunt {
+        return measure_wakes(&HuntOptions { seconds, rate_hz: arguments.rate }, arguments.json);
     }
     let scenario = load(arguments.file.as_deref(), []).map_err(|error| fail(Exit::Usage, error))?;
     // A failure appears in the line on leftovers.
@@ -86,6 +111,24 @@ pub fn doctor(arguments: &Arguments) -> CommandResult {
     say(&text).map(|exit| if diagnosis.fit == Some(false) { Exit::NotAccepted } else { exit })
 }
 
+/// Measures the lateness of wakes, with a progress bar on a terminal. A signal ends it early.
+fn measure_wakes(options: &HuntOptions, json: bool) -> CommandResult {
+    let ended = terminated_by_signals()?;
+    let bar = progress_bar(options.ticks(), "{bar:40} measuring wake-ups, {eta} left; Ctrl-C ends it with a report");
+    let report = hunt(options, &ended, &mut |tick| bar.set_position(tick));
+    bar.finish_and_clear();
+    let report = report.map_err(|error| {
+        let text = format!("cannot start a thread: {error}; {}", remedy(&error));
+        fail(Exit::Failure, Failure::new("cannot-start", text))
+    })?;
+    say(&if json { report.to_json() } else { harmless(&report.to_string()) })
+}
+
+fn progress_bar(length: u64, template: &str) -> ProgressBar {
+    let style = ProgressStyle::with_template(template);
+    ProgressBar::new(length).with_style(style.expect("the template is a constant that parses"))
+}
+
 /// The reason why there is no measurement.
 enum TrialError {
     /// The run failed; the line contains the reason.
@@ -103,8 +146,7 @@ fn attempt(arguments: &Arguments) -> Result<Trial, TrialError> {
     let scenario = load(arguments.file.as_deref(), overrides.map(Change::Set))
         .map_err(|error| TrialError::Failed(Trial::failed(error.to_string())))?;
     let signal = catch_signals().map_err(|error| TrialError::Exit(fail(Exit::Failure, error)))?;
-    let style = ProgressStyle::with_template("{bar:40} running in real time, {eta} left");
-    let bar = ProgressBar::new(scenario.last_tick).with_style(style.expect("the template is a constant that parses"));
+    let bar = progress_bar(scenario.last_tick, "{bar:40} running in real time, {eta} left");
     let mut show = |progress: &Progress<'_>| {
         if let Progress::Running { tick, .. } = progress {
             bar.set_position(*tick);

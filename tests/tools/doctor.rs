@@ -1,8 +1,9 @@
 //! `corotate doctor` on the machine that runs the tests.
 
 use crate::common::{self, Bench, await_some};
-use libc::{SIGKILL, SIGSTOP, SIGTERM};
+use libc::{SIGINT, SIGKILL, SIGSTOP, SIGTERM};
 use serde_json::Value;
+use std::fs;
 
 fn checks(report: &Value) -> Vec<(&str, &str)> {
     let checks = report["checks"].as_array().unwrap();
@@ -120,6 +121,93 @@ fn clean_removes_the_files_of_killed_runs_only() {
     running.signal(SIGTERM);
     running.wait();
     bench.assert_clean(&[dead, alive]);
+}
+
+/// Runs a hunt of a second, checks what holds on every machine, and returns the report.
+fn hunt(bench: &Bench, options: &[&str], rate_hz: u64) -> Value {
+    let running = bench.start(&[&["doctor", "--hunt", "1", "--json"], options].concat());
+    let instance = format!("corotate-{}-", running.pid());
+    let report = running.wait().succeeded().json();
+    assert_eq!((&report["schema"], report["rate_hz"].as_u64()), (&Value::from("corotate/hunt/v1"), Some(rate_hz)));
+    let cores = report["cores"].as_array().unwrap();
+    assert_eq!(cores.len(), corotate::runtime::usable_cores().len(), "{report}");
+    let late = &report["late"];
+    let number = |value: &Value| value.as_u64().unwrap();
+    for core in cores {
+        let (figures, [wakes, missed]) = (&core["lateness"], ["wakes", "missed"].map(|key| number(&core[key])));
+        assert_eq!((wakes + missed, &figures["count"], &figures["missed"]), (rate_hz, &rate_hz.into(), &missed.into()));
+        let values =
+            ["min_us", "p50_us", "p90_us", "p99_us", "p999_us", "max_us"].map(|key| figures[key].as_f64().unwrap());
+        assert!(values[0] >= 0.0 && values.is_sorted(), "{core}");
+        // The longest delay is a late tick if it exceeds the limit by more than the histogram resolves.
+        assert!(number(&core["late"]) > 0 || values[5] <= 1.01 * late["late_us"].as_f64().unwrap(), "{report}");
+    }
+    let counted: u64 = cores.iter().map(|core| number(&core["late"])).sum();
+    assert_eq!((late["schema"].as_str(), number(&late["counted"])), (Some("corotate/late/v1"), counted));
+    assert!(number(&late["examined"]) <= counted, "{late}");
+    let explained = |tick: &Value| {
+        let causes = tick["causes"].as_array().unwrap().iter();
+        causes.map(|cause| cause["us"].as_f64().unwrap()).sum::<f64>() <= tick["late_us"].as_f64().unwrap() + 1e-6
+    };
+    assert!(late["ticks"].as_array().unwrap().iter().all(explained), "{late}");
+    // Without the kernel's trace there is a reason, and a remedy.
+    assert_eq!(
+        (late["source"] == "counters", late["tracer"].is_null()),
+        (late["note"].is_string(), late["note"].is_string())
+    );
+    let instances = fs::read_dir("/sys/kernel/tracing/instances").into_iter().flatten().flatten();
+    let left: Vec<_> = instances.map(|entry| entry.file_name()).collect();
+    assert!(!left.iter().any(|name| name.to_string_lossy().starts_with(&instance)), "{left:?}");
+    report
+}
+
+#[test]
+fn a_hunt_measures_every_core_and_leaves_no_trace_behind() {
+    let bench = Bench::new();
+    hunt(&bench, &[], 1000);
+    hunt(&bench, &["--rate", "10"], 10);
+    bench.assert_clean(&[]);
+}
+
+#[test]
+fn an_unprivileged_user_hunts_with_counters() {
+    let bench = Bench::unprivileged();
+    let report = hunt(&bench, &["--rate", "200"], 200);
+    if rustix::process::getuid().is_root() {
+        assert_eq!(report["late"]["source"], "counters", "{report}");
+    }
+    let causes = report["late"]["causes"].as_array().unwrap();
+    assert!(report["late"]["source"] == "kernel" || causes.iter().all(|cause| cause["name"] == ""), "{causes:?}");
+    let text = bench.run(&["doctor", "--hunt", "1", "--rate", "10"]).succeeded().stdout;
+    assert!(text.contains("p99.9 us") && text.contains("core ") && text.contains("causes from "), "{text}");
+}
+
+/// A hunt that a signal ends reports what it has measured.
+#[test]
+fn an_interrupted_hunt_reports() {
+    let bench = Bench::new();
+    let running = bench.start(&["doctor", "--hunt", "3600", "--json"]);
+    std::thread::sleep(std::time::Duration::from_secs(1));
+    running.signal(SIGINT);
+    let report = running.wait().succeeded().json();
+    for core in report["cores"].as_array().unwrap() {
+        let [wakes, missed, count] =
+            [&core["wakes"], &core["missed"], &core["lateness"]["count"]].map(|count| count.as_u64().unwrap());
+        assert!(count < 3_600_000 && wakes + missed == count, "{core}");
+    }
+    bench.assert_clean(&[]);
+}
+
+#[test]
+fn a_hunt_takes_no_scenario_and_no_other_measurement() {
+    let bench = Bench::new();
+    let hunt = ["doctor", "--hunt", "1"];
+    for options in [&["rigid-pair"][..], &["--seconds", "1"], &["--clean"], &["--rate", "9"], &["--rate", "20001"]] {
+        assert_eq!(bench.run(&[&hunt, options].concat()).code, Some(2), "{options:?}");
+    }
+    for options in [&["--rate", "100"][..], &["--hunt", "0"], &["--hunt", "1", "--link", "tcp/127.0.0.1:1"]] {
+        assert_eq!(bench.run(&[&["doctor"], options].concat()).code, Some(2), "{options:?}");
+    }
 }
 
 #[test]

@@ -10,11 +10,12 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 
 /// Commands that are not run here: first words, and where the command is run or why it cannot be.
-const ELSEWHERE: [(&str, &str); 31] = [
+const ELSEWHERE: [(&str, &str); 32] = [
     ("corotate run pair.toml --host", "it waits for another host; tests/runs/hosts"),
     ("corotate run pair.toml --clock lockstep --debug", "it waits for a debugger; tests/runs/debugging.rs"),
     ("corotate join", "it needs a run to join; tests/runs/hosts"),
     ("corotate doctor --link", "it needs a run that waits; tests/runs/hosts"),
+    ("corotate doctor --hunt", "it takes a minute; tests/tools/doctor.rs, a second"),
     ("cargo run --release", "tests/run builds it so; `run` without arguments is run here"),
     ("tests/run", "it runs this test"),
     ("cargo install --path . --locked", "tests/run"),
