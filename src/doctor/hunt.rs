@@ -10,8 +10,7 @@ use crate::late::{Cause, Delay, LateKind, LateTick, TraceRing, causes_by_counter
 use crate::runtime::{RoleId, hold_low_latency_idle, usable_cores};
 use crate::system::name_thread;
 use crate::telemetry::{Grant, LateRecord};
-use corotate_trace::{Duty, Facts, Phase};
-use std::cmp::Reverse;
+use corotate_trace::{Duty, Facts, Phase, Window};
 use std::io;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -28,9 +27,8 @@ const POLL_NS: u64 = 20_000_000;
 const ROOM: usize = 4096;
 /// The number of late wakes of a core that are examined, as of a role. Further ones are only counted.
 const EXAMINED: usize = 2048;
-/// The number of events, about, that are decoded at each look, the longest delays first: more would cost a core. The causes of the
-/// other late wakes come from counters.
-const DECODED: u64 = 50_000;
+/// Longest time from the first due time to the last wake for which late wakes share their events, ns.
+const SHARED_NS: u64 = 100_000_000;
 
 /// Measures the lateness of the wakes on each core of this process, and finds the causes of late ones, until `ended` or for the
 /// given duration. `progress` is called with the number of ticks so far.
@@ -166,27 +164,46 @@ impl Hunter {
         }
         // After the late wakes: the trace then reaches beyond them.
         self.ring.iter_mut().for_each(TraceRing::read);
-        late.sort_by_key(|(_, wake)| Reverse(wake.record.done_ns - wake.record.due_ns));
-        let decoded = |hunter: &Self| hunter.ring.as_ref().map_or(0, TraceRing::decoded);
-        let begun = decoded(self);
-        for (core, wake) in &late {
-            let traced = if decoded(self) - begun < DECODED { self.causes_by_trace(&wake.record) } else { None };
-            let delay = Delay { role: RoleId::Plant(*core), record: wake.record, period_ns: self.period_ns };
-            let causes = traced.unwrap_or_else(|| causes_by_counters(&delay));
-            self.ticks.push(late_tick(*core, wake, causes, self.epoch_ns));
+        late.sort_by_key(|(_, wake)| wake.record.due_ns);
+        let mut rest = &late[..];
+        while !rest.is_empty() {
+            let (due_ns, done_ns, count) = first_group(rest);
+            let (group, later) = rest.split_at(count);
+            rest = later;
+            let window = self.ring.as_mut().map(|ring| ring.around(due_ns, done_ns, self.period_ns));
+            let window = window.filter(|window| !window.has_losses());
+            for (core, wake) in group {
+                let delay = Delay { role: RoleId::Plant(*core), record: wake.record, period_ns: self.period_ns };
+                let counted = || causes_by_counters(&delay);
+                let causes = window.as_ref().map_or_else(counted, |window| causes_by_trace(window, &wake.record));
+                self.ticks.push(late_tick(*core, wake, causes, self.epoch_ns));
+            }
         }
     }
+}
 
-    /// Returns the causes of a late wake by name; `None` without a trace, or if events are missing.
-    fn causes_by_trace(&mut self, record: &LateRecord) -> Option<Vec<Cause>> {
-        let LateRecord { due_ns, done_ns, usage, .. } = *record;
-        let window = self.ring.as_mut()?.around(due_ns, done_ns, self.period_ns);
-        let facts = Facts { throttled_ns: usage.throttled_ns, major_faults: usage.major_faults > 0 };
-        // From its due time to its look at the clock a probe has nothing to compute: time on the core is time without it.
-        let duty = Duty::Timer { gap: (due_ns, done_ns) };
-        let phase = Phase { from_ns: due_ns, to_ns: done_ns, duty };
-        (!window.has_losses()).then(|| window.blame(record.tid as i32, facts, &[phase]))
+/// Returns the first due time, the last wake and the number of those first late wakes that share their events. They are in the
+/// order of their due times, and there is one at least.
+fn first_group(late: &[(usize, LateWake)]) -> (u64, u64, usize) {
+    let (due_ns, mut done_ns) = (late[0].1.record.due_ns, late[0].1.record.done_ns);
+    let mut count = 1;
+    for (_, wake) in &late[1..] {
+        let end_ns = done_ns.max(wake.record.done_ns);
+        if end_ns - due_ns > SHARED_NS {
+            break;
+        }
+        (done_ns, count) = (end_ns, count + 1);
     }
+    (due_ns, done_ns, count)
+}
+
+/// Returns the causes of a late wake by name.
+fn causes_by_trace(window: &Window, record: &LateRecord) -> Vec<Cause> {
+    let LateRecord { due_ns, done_ns, usage, .. } = *record;
+    let facts = Facts { throttled_ns: usage.throttled_ns, major_faults: usage.major_faults > 0 };
+    // From its due time to its look at the clock a probe has nothing to compute: time on the core is time without it.
+    let duty = Duty::Timer { gap: (due_ns, done_ns) };
+    window.blame(record.tid as i32, facts, &[Phase { from_ns: due_ns, to_ns: done_ns, duty }])
 }
 
 fn late_tick(core: usize, wake: &LateWake, causes: Vec<Cause>, epoch_ns: u64) -> LateTick {
@@ -238,14 +255,27 @@ mod tests {
             (late.role.clone(), late.tick, late.time_s, late.late_us, causes)
         };
         let core = || "core 3".to_owned();
-        // The longest delay first; the third one is beyond the number that is examined.
+        // The third one is beyond the number that is examined.
         assert_eq!(
             hunter.ticks.iter().map(found).collect::<Vec<_>>(),
             [
-                (core(), 9, 0.009, 400.0, vec![(CauseKind::LateTimer, 399.0)]),
                 (core(), 5, 0.005, 200.0, vec![(CauseKind::Task, 150.0), (CauseKind::LateTimer, 50.0)]),
+                (core(), 9, 0.009, 400.0, vec![(CauseKind::LateTimer, 399.0)]),
             ]
         );
+    }
+
+    #[test]
+    fn late_wakes_close_to_each_other_share_their_events() {
+        let late = |tick: u64, late_ms: u64| (0, wake(tick, late_ms * MS, Usage::default()));
+        let group = |wakes: &[(usize, LateWake)]| {
+            let (due_ns, done_ns, count) = first_group(wakes);
+            (due_ns / MS, done_ns / MS, count)
+        };
+        assert_eq!(group(&[late(0, 1)]), (1000, 1001, 1));
+        assert_eq!(group(&[late(0, 50), late(1, 2), late(90, 10), late(90, 11)]), (1000, 1100, 3));
+        assert_eq!(group(&[late(0, 900), late(1, 1)]), (1000, 1900, 1), "a long delay has its own");
+        assert_eq!(group(&[late(0, 1), late(1, 900), late(2, 1)]), (1000, 1001, 1));
     }
 
     #[test]
