@@ -5,15 +5,20 @@ use crate::bus::domain::Domain;
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Trace};
 use crate::scenario::Scenario;
-use crate::seat::report_path;
+use crate::seat::{report_path, write_whole};
 use corotate_trace::require_tracefs;
+use rustix::fs::{FlockOperation, flock};
+use rustix::io::Errno;
 use serde::{Deserialize, Serialize};
+use std::fs::File;
+use std::io;
 use std::path::PathBuf;
 
 /// The name of the process.
 pub const TRACER: &str = "tracer";
-/// The longest wait of another process for the findings, and the interval between two looks at them, ns.
-const FINDINGS_NS: u64 = 2_000_000_000;
+/// The longest wait of another process for the findings, and the interval between two looks at them, ns. At its end the process decodes
+/// many events.
+const FINDINGS_NS: u64 = 6_000_000_000;
 const LOOK_NS: u64 = 5_000_000;
 
 /// Findings of the process.
@@ -49,6 +54,21 @@ pub fn ready_path(domain: &Domain) -> PathBuf {
     domain.root().join("tracer.ready")
 }
 
+/// Writes this file. The process holds it locked until it ends, so that others notice its death.
+pub(super) fn announce_ready(domain: &Domain) -> io::Result<File> {
+    let path = ready_path(domain);
+    write_whole(&path, b"")?;
+    let file = File::open(path)?;
+    flock(&file, FlockOperation::NonBlockingLockExclusive)?;
+    Ok(file)
+}
+
+/// Returns true while the process holds that file.
+fn is_alive(domain: &Domain) -> bool {
+    let file = File::open(ready_path(domain));
+    file.is_ok_and(|file| flock(&file, FlockOperation::NonBlockingLockShared) == Err(Errno::WOULDBLOCK))
+}
+
 /// Returns the findings of the process in a domain.
 pub fn findings(domain: &Domain) -> Option<Findings> {
     serde_json::from_slice(&std::fs::read(report_path(domain.root(), TRACER)).ok()?).ok()
@@ -65,7 +85,7 @@ pub fn trace_refusal(scenario: &Scenario) -> Option<String> {
 }
 
 /// Waits until the process of a stopped run has written its findings. Returns them, or the reason why they are missing. Does not wait if
-/// the run has no such process.
+/// the run has no such process, or if it died.
 pub fn await_findings(
     domain: &Domain,
     scenario: &Scenario,
@@ -76,10 +96,39 @@ pub fn await_findings(
     }
     let end_ns = monotonic_ns() + FINDINGS_NS;
     loop {
+        // Looked at first: it may end after it has written them.
+        let may_come = is_alive(domain) && monotonic_ns() < end_ns && may_wait();
         match findings(domain) {
             Some(findings) => return Ok(findings),
-            None if monotonic_ns() < end_ns && may_wait() => sleep_until(monotonic_ns() + LOOK_NS),
-            None => return Err(Some("the tracing process left no findings in time".to_owned())),
+            None if may_come => sleep_until(monotonic_ns() + LOOK_NS),
+            None => return Err(Some("the tracing process left no report".to_owned())),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bus::domain::OwnedDomain;
+    use crate::config::SHIPPED;
+
+    #[test]
+    fn only_a_living_process_is_waited_for() {
+        let scenario = Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &["clock=realtime".to_owned()]).unwrap();
+        let owned = OwnedDomain::create(1 << 20).unwrap();
+        let domain = owned.domain();
+        let wait = |may_wait: &dyn Fn() -> bool| await_findings(domain, &scenario, may_wait);
+        assert!(wait(&|| unreachable!("without a process")).is_err());
+        let held = announce_ready(domain).unwrap();
+        let write = || {
+            let text = serde_json::to_vec(&Findings::default()).unwrap();
+            write_whole(&report_path(domain.root(), TRACER), &text).unwrap();
+            true
+        };
+        assert!(wait(&|| false).unwrap_err().unwrap().contains("no report"));
+        assert!(wait(&write).is_ok());
+        std::fs::remove_file(report_path(domain.root(), TRACER)).unwrap();
+        drop(held);
+        assert!(wait(&|| unreachable!("it is dead")).is_err());
     }
 }

@@ -6,7 +6,7 @@
 use super::Cause;
 use super::delay::Delay;
 use super::explain::{causes, input_causes, slices};
-use super::findings::{Finding, Findings, TRACER, ready_path};
+use super::findings::{Finding, Findings, TRACER, announce_ready, ready_path};
 use super::last::{Candidate, last_path};
 use super::ring::{KEPT_NS, TraceRing};
 use crate::bus::domain::Domain;
@@ -39,8 +39,7 @@ pub fn run_tracer(root: &Path, terminated: &AtomicBool) -> Result<(), RoleError>
     let failed = |path: PathBuf| move |source| RoleError::Report { path, source };
     name_thread(TRACER);
     let tracer = Tracer::start(&domain, &scenario);
-    let ready = ready_path(&domain);
-    write_whole(&ready, b"").map_err(failed(ready))?;
+    let _held = announce_ready(&domain).map_err(failed(ready_path(&domain)))?;
     let found = match tracer {
         Ok(tracer) => tracer.follow(&domain, terminated),
         Err(error) => Findings { note: Some(error.to_string()), ..Findings::default() },
