@@ -207,6 +207,9 @@ fn can_disturb(what: &str) -> bool {
     }
 }
 
+/// Returns true if a main cause is the planted one.
+type IsRight = dyn Fn(CauseKind, &str) -> bool;
+
 /// Plants one culprit in a run with each source, and asserts that the main cause is right: by name in the kernel's trace, by kind in the
 /// counters.
 #[track_caller]
@@ -214,7 +217,7 @@ fn assert_culprit(
     what: &str,
     options: &[&str],
     disturb: impl Fn(&Bench, &AtomicBool) -> Times + Sync,
-    [named, of_kind]: [&dyn Fn(CauseKind, &str) -> bool; 2],
+    [named, of_kind]: [&IsRight; 2],
 ) {
     if !can_disturb(what) {
         return;
@@ -223,7 +226,7 @@ fn assert_culprit(
     for trace in ["kernel", "counters"] {
         let (report, times) = run_beside(&bench, trace, &[options, &["--overwrite"]].concat(), &disturb);
         let late = planted(&report, &times);
-        let is = |right: &dyn Fn(CauseKind, &str) -> bool, late: &LateTick| {
+        let is = |right: &IsRight, late: &LateTick| {
             let (kind, name) = main_cause(late);
             right(kind, name)
         };

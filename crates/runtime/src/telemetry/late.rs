@@ -196,7 +196,7 @@ mod tests {
         assert_eq!((reader.entered(), reader.records(0).count()), (0, 0));
         let record = |tick: u64| LateRecord {
             tick,
-            starved: tick % 2 == 0,
+            starved: tick.is_multiple_of(2),
             due_ns: tick << 20,
             usage: Usage { run_delay_ns: tick, ..Usage::default() },
             since_ns: u64::MAX,
