@@ -200,7 +200,7 @@ fn first_group(late: &[(usize, LateWake)]) -> (u64, u64, usize) {
 /// Returns the causes of a late wake by name.
 fn causes_by_trace(window: &Window, record: &LateRecord) -> Vec<Cause> {
     let LateRecord { due_ns, done_ns, usage, .. } = *record;
-    let facts = Facts { throttled_ns: usage.throttled_ns, major_faults: usage.major_faults > 0 };
+    let facts = Facts { throttled_ns: usage.throttled_ns, major_faults: usage.major_faults > 0, limited: false };
     // From its due time to its look at the clock a probe has nothing to compute: time on the core is time without it.
     let duty = Duty::Timer { gap: (due_ns, done_ns) };
     window.blame(record.tid as i32, facts, &[Phase { from_ns: due_ns, to_ns: done_ns, duty }])

@@ -11,8 +11,8 @@ const SHOWN_NS: u64 = 20_000_000;
 const SLICES: usize = 400;
 
 /// Returns the causes of the part of a delay that no input accounts for; `None` if events are missing. `sender` is the thread of the
-/// sender of its input, or 0.
-pub fn causes(delay: &Delay, sender: i32, window: &Window) -> Option<Vec<Cause>> {
+/// sender of its input, or 0; `limited` is true if a cgroup limits the processor time of the roles.
+pub fn causes(delay: &Delay, sender: i32, limited: bool, window: &Window) -> Option<Vec<Cause>> {
     if window.has_losses() {
         return None;
     }
@@ -21,7 +21,7 @@ pub fn causes(delay: &Delay, sender: i32, window: &Window) -> Option<Vec<Cause>>
         return Some(vec![Cause::new(CauseKind::Fault, "", delay.ns() - delay.input_ns())]);
     }
     let usage = &record.usage;
-    let facts = Facts { throttled_ns: usage.throttled_ns, major_faults: usage.major_faults > 0 };
+    let facts = Facts { throttled_ns: usage.throttled_ns, major_faults: usage.major_faults > 0, limited };
     let gap = (record.gap_end_ns.saturating_sub(record.gap_ns), record.gap_end_ns);
     let timed = record.slept;
     let duty = if delay.sender().is_none() { Duty::Timer { gap } } else { Duty::Wake { sender, timed, gap } };

@@ -11,7 +11,7 @@ use super::last::{Candidate, last_path};
 use super::ring::{KEPT_NS, TraceRing};
 use crate::bus::domain::Domain;
 use crate::clock::{monotonic_ns, sleep_until};
-use crate::runtime::{RoleId, late_log};
+use crate::runtime::{RoleId, cpu_quota, late_log};
 use crate::scenario::Scenario;
 use crate::seat::{RoleError, join_complete, open_ledger, report_path, write_whole};
 use crate::system::name_thread;
@@ -55,6 +55,8 @@ struct Tracer<'a> {
     scenario: &'a Scenario,
     ring: TraceRing,
     roles: Vec<TracedRole>,
+    /// True if a cgroup limits the processor time of the roles, which have the same group as this process.
+    limited: bool,
     /// Late ticks that are not explained: role, index of the record, delay.
     pending: Vec<(usize, usize, Delay)>,
     findings: Vec<Finding>,
@@ -83,7 +85,8 @@ impl<'a> Tracer<'a> {
         });
         let roles = roles.collect();
         let (pending, findings) = (Vec::new(), Vec::new());
-        Ok(Self { scenario, ring, roles, pending, findings, last: None, published: None })
+        let limited = cpu_quota(Path::new("/")).is_some();
+        Ok(Self { scenario, ring, roles, limited, pending, findings, last: None, published: None })
     }
 
     fn follow(mut self, domain: &Domain, terminated: &AtomicBool) -> Findings {
@@ -168,7 +171,7 @@ impl<'a> Tracer<'a> {
             None => cause,
         };
         let named = |causes: Vec<Cause>| causes.into_iter().map(named).collect();
-        let Some(causes) = causes(delay, sender, &window).map(named) else { return };
+        let Some(causes) = causes(delay, sender, self.limited, &window).map(named) else { return };
         let input_causes = named(input_causes(delay, sender, &window));
         let delay_ns = delay.ns();
         let slices = if self.is_shown(delay_ns) { slices(delay, &window, name) } else { Vec::new() };

@@ -12,6 +12,8 @@ const FAULTS_NS: u64 = 50_000;
 /// Shortest time without any event that counts as a core taken, ns. Running code of the kernel and short pauses of the host are below.
 const SILENCE_NS: u64 = 20_000;
 
+/// Longest time for which an idle core may take to run a task that it was woken for, where a limit could stop the task, ns.
+const IDLE_NS: u64 = 200_000;
 /// The name of a core that was taken without any event on it, and of a timer that was late on an idle core.
 const HYPERVISOR: &str = "hypervisor";
 const IDLE_CORE: &str = "idle core";
@@ -65,6 +67,8 @@ pub enum Duty {
 pub struct Facts {
     /// Time for which the limit of a cgroup stopped it, ns.
     pub throttled_ns: u64,
+    /// True if a cgroup limits its processor time: then it is stopped if it can run and its core is idle.
+    pub limited: bool,
     /// True if it took page faults with input or output.
     pub major_faults: bool,
 }
@@ -213,7 +217,13 @@ impl Blame<'_> {
         }
         let spans: Vec<Span> =
             self.window.cores.get(&core).map_or_else(Vec::new, |core| core.within(from_ns, to_ns).collect());
-        spans.iter().for_each(|span| self.occupant(span));
+        for span in &spans {
+            let ns = span.to_ns - span.from_ns;
+            match self.facts.limited && span.occupant == Occupant::Idle && ns >= IDLE_NS {
+                true => self.add_kind(CauseKind::Throttled, ns),
+                false => self.occupant(span),
+            }
+        }
     }
 
     /// Blames a timer or a sender that should have woken the thread.
@@ -395,6 +405,21 @@ mod tests {
         assert_eq!(causes, [(CauseKind::IdleCore, String::new(), 450.0)]);
     }
 
+    /// The task that leaves a core was not the first one that was woken for it.
+    #[test]
+    fn the_task_that_an_idle_core_chose_is_seen_when_it_leaves() {
+        let events = vec![
+            switch(10, ROLE, TaskState::Sleeping, 0),
+            waking(940, ROLE),
+            waking(941, HOG),
+            switch(1700, HOG, TaskState::Sleeping, ROLE),
+        ];
+        let causes = blame(events, timer_duty(), 1000, 1701);
+        assert_eq!(causes[0], (CauseKind::Task, "hog".to_owned(), 700.0));
+        let unknown = vec![switch(10, ROLE, TaskState::Runnable, 0), switch(1700, HOG, TaskState::Sleeping, ROLE)];
+        assert_eq!(blame(unknown, timer_duty(), 1000, 1700), [], "the hog began at an unknown time");
+    }
+
     #[test]
     fn stops_quotas_and_page_faults_are_told_apart() {
         let stopped = vec![
@@ -408,6 +433,8 @@ mod tests {
         let phase = Phase { from_ns: 1000 * US, to_ns: 1900 * US, duty: timer_duty() };
         let causes = window.blame(ROLE, Facts { throttled_ns: 80_000 * US, ..Facts::default() }, &[phase]);
         assert_eq!((causes.len(), causes[0].kind, causes[0].us), (1, CauseKind::Throttled, 900.0));
+        let limited = window.blame(ROLE, Facts { limited: true, ..Facts::default() }, &[phase]);
+        assert_eq!((limited.len(), limited[0].kind), (1, CauseKind::Throttled), "its core was idle");
         let mut faults = vec![switch(10, 0, TaskState::Runnable, ROLE), switch(5000, ROLE, TaskState::Sleeping, 0)];
         faults.extend((1000..1200).map(|us| event(us, 0, EventKind::PageFault { tid: ROLE })));
         faults.sort_by_key(|event| event.ns);

@@ -23,11 +23,11 @@ pub fn complete_switches(events: &mut Vec<Event>) {
                 }
                 core.records_exits |= from.tid == 0;
                 core.idle = (to.tid == 0).then(|| to.clone());
-                core.woken = None;
+                core.woken.clear();
             }
             EventKind::Waking { task, target, .. } => {
                 let core = cores.entry(*target).or_default();
-                core.woken.get_or_insert((event.ns, task.clone()));
+                core.woken.push((event.ns, task.clone()));
             }
             _ => {}
         }
@@ -45,17 +45,20 @@ pub fn complete_switches(events: &mut Vec<Event>) {
 struct IdleCore {
     /// The idle task while it runs.
     idle: Option<Task>,
-    /// The first task that was woken for the core since its last switch.
-    woken: Option<(u64, Task)>,
+    /// The tasks that were woken for the core since its last switch.
+    woken: Vec<(u64, Task)>,
     records_exits: bool,
 }
 
 impl IdleCore {
-    /// Returns the switch from the idle task to the woken one, if that is `expected`.
+    /// Returns the switch from the idle task to `expected`, or to the first task that was woken, at its wake-up.
     fn switch(&self, core: usize, expected: Option<&Task>) -> Option<Event> {
-        let (from, (ns, to)) = (self.idle.clone()?, self.woken.clone()?);
-        let known = expected.is_none_or(|expected| expected.tid == to.tid);
-        known.then_some(Event { ns, core, kind: EventKind::Switch { from, state: TaskState::Runnable, to } })
+        let from = self.idle.clone()?;
+        let (first_ns, first) = self.woken.first()?;
+        let ns = self.woken.iter().find(|(_, task)| expected.is_some_and(|expected| expected.tid == task.tid));
+        let ns = ns.map_or(*first_ns, |(ns, _)| *ns);
+        let to = expected.unwrap_or(first).clone();
+        Some(Event { ns, core, kind: EventKind::Switch { from, state: TaskState::Runnable, to } })
     }
 }
 
@@ -150,6 +153,12 @@ impl CoreBuilder {
                     unknown.for_each(|span| span.occupant = occupant.clone());
                 }
                 self.rename(from);
+                if self.task.as_ref().is_some_and(|task| task.tid == 0) && from.tid != 0 {
+                    // The core has left its idle task at an unknown time.
+                    let idle =
+                        self.timeline.spans[self.since..].iter_mut().filter(|span| span.occupant == Occupant::Idle);
+                    idle.for_each(|span| span.occupant = Occupant::Unknown);
+                }
                 self.task = Some(to.clone());
                 self.since = self.timeline.spans.len();
                 self.interrupts.clear();
