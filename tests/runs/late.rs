@@ -5,6 +5,7 @@ use corotate::clock::raw_ns;
 use corotate::late::{CauseKind, LateReport, LateTick};
 use rustix::thread::{CpuSet, sched_setaffinity};
 use std::ffi::CString;
+use std::net::UdpSocket;
 use std::path::Path;
 use std::process::Command;
 use std::sync::Mutex;
@@ -134,14 +135,20 @@ fn at_random_instants(ended: &AtomicBool, mut disturb: impl FnMut(&mut Times)) -
     times
 }
 
-/// Computes on core 1 for `busy` at random instants. Times in which another task had its core are left out.
+/// Computes on core 1 for `busy` at random instants.
 fn hog(priority: &[&str], busy: Duration, ended: &AtomicBool) -> Times {
-    const PREEMPTED_NS: u64 = 20_000;
+    work(priority, busy, ended, || ())
+}
+
+/// Repeats `step` on core 1 for `busy` at random instants. Times in which another task had its core are left out.
+fn work(priority: &[&str], busy: Duration, ended: &AtomicBool, mut step: impl FnMut()) -> Times {
+    const PREEMPTED_NS: u64 = 50_000;
     become_culprit(1, priority);
     at_random_instants(ended, |times| {
         let (mut begun_ns, mut last_ns) = (raw_ns(), raw_ns());
         let end_ns = begun_ns + busy.as_nanos() as u64;
         while last_ns < end_ns {
+            step();
             let now_ns = raw_ns();
             if now_ns - last_ns > PREEMPTED_NS {
                 times.push((begun_ns, last_ns));
@@ -211,18 +218,19 @@ fn can_disturb(what: &str) -> bool {
 type IsRight = dyn Fn(CauseKind, &str) -> bool;
 
 /// Plants one culprit in a run with each source, and asserts that the main cause is right: by name in the kernel's trace, by kind in the
-/// counters.
+/// counters. Returns the report with the kernel's trace.
 #[track_caller]
 fn assert_culprit(
     what: &str,
     options: &[&str],
     disturb: impl Fn(&Bench, &AtomicBool) -> Times + Sync,
     [named, of_kind]: [&IsRight; 2],
-) {
+) -> Option<LateReport> {
     if !can_disturb(what) {
-        return;
+        return None;
     }
     let bench = Bench::new();
+    let mut traced = None;
     for trace in ["kernel", "counters"] {
         let (report, times) = run_beside(&bench, trace, &[options, &["--overwrite"]].concat(), &disturb);
         let late = planted(&report, &times);
@@ -234,13 +242,15 @@ fn assert_culprit(
             assert_named(&late, 0.8, |late| is(of_kind, late));
         } else if has_kernel_trace(&report, what) {
             assert_named(&late, 0.95, |late| is(named, late));
+            traced = Some(report.clone());
         }
     }
+    traced
 }
 
 #[test]
 fn a_task_of_higher_priority_is_named() {
-    assert_culprit(
+    let _ = assert_culprit(
         "a task of higher priority as the cause of late ticks",
         &["--set=realtime.cores=[1]", "--set=realtime.late_us=300"],
         |_, ended| hog(&["chrt", "-f", "-p", "95"], Duration::from_micros(800), ended),
@@ -250,12 +260,40 @@ fn a_task_of_higher_priority_is_named() {
 
 #[test]
 fn an_ordinary_task_beside_unprivileged_roles_is_named() {
-    assert_culprit(
+    let _ = assert_culprit(
         "an ordinary task as the cause of late ticks",
         &["--set=realtime.cores=[1]", "--set=realtime.priority=0", "--set=realtime.late_us=300"],
         |_, ended| hog(&["renice", "-n", "-20", "-p"], Duration::from_millis(3), ended),
         [&|kind, name| (kind, name) == (CauseKind::Task, CULPRIT), &|kind, _| kind == CauseKind::Task],
     );
+}
+
+/// Packets over loopback are received in a softirq in the time of their sender.
+#[test]
+fn network_load_is_named() {
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let to = socket.local_addr().unwrap();
+    // A full queue drops packets.
+    let flood = |_: &Bench, ended: &AtomicBool| {
+        work(&["renice", "-n", "-20", "-p"], Duration::from_millis(3), ended, || {
+            let _ = socket.send_to(&[0; 1024], to);
+        })
+    };
+    let kernel = assert_culprit(
+        "network load as the cause of late ticks",
+        &["--set=realtime.cores=[1]", "--set=realtime.priority=0", "--set=realtime.late_us=300"],
+        flood,
+        [
+            &|kind, name| {
+                matches!((kind, name), (CauseKind::Task, CULPRIT | "ksoftirqd/1") | (CauseKind::Softirq, "NET_RX"))
+            },
+            &|kind, _| matches!(kind, CauseKind::Task | CauseKind::CoreTaken),
+        ],
+    );
+    if let Some(report) = kernel {
+        let received = report.causes.iter().find(|total| (total.kind, &*total.name) == (CauseKind::Softirq, "NET_RX"));
+        assert!(received.is_some_and(|total| total.ticks > 0), "{:?}", report.causes);
+    }
 }
 
 #[test]
@@ -271,7 +309,7 @@ fn a_stop_by_a_signal_is_named() {
         })
     };
     let stopped = |kind, _: &str| kind == CauseKind::Stopped;
-    assert_culprit("a stop by a signal as the cause of late ticks", &[], stop, [&stopped, &stopped]);
+    let _ = assert_culprit("a stop by a signal as the cause of late ticks", &[], stop, [&stopped, &stopped]);
 }
 
 #[test]
