@@ -34,7 +34,7 @@ pub struct SampleMark<'a> {
 /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
 /// let report = LateReport::parse(br#"{
 ///     "schema": "corotate/late/v1", "run": null, "scenario": "rigid-pair", "period_us": 1000, "late_us": 100, "source": "counters",
-///     "counted": 0, "ticks": [], "causes": [], "patterns": []
+///     "counted": 0, "examined": 0, "ticks": [], "causes": [], "patterns": []
 /// }"#)?;
 /// let mut trace = Perfetto::new(Vec::new(), &report)?;
 /// trace.sample(&SampleMark { role: "leader", signal: "leader/measurement", tick: 0, sent_ns: 1_500 })?;

@@ -17,7 +17,7 @@ const RESULT_ROWS: usize = 8;
 /// The end of a serial line's text if it had no fault.
 const NO_FAULT: &str = "; no fault";
 /// Lines of late ticks by cause, by default and with all.
-const LATE_LINES: usize = 4;
+const LATE_LINES: usize = 3;
 const LATE_LINES_ALL: usize = 8;
 /// Incidents that are shown by default.
 const INCIDENTS: usize = 4;

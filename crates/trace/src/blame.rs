@@ -217,13 +217,12 @@ impl Blame<'_> {
         }
         let spans: Vec<Span> =
             self.window.cores.get(&core).map_or_else(Vec::new, |core| core.within(from_ns, to_ns).collect());
-        for span in &spans {
-            let ns = span.to_ns - span.from_ns;
-            match self.facts.limited && span.occupant == Occupant::Idle && ns >= IDLE_NS {
-                true => self.add_kind(CauseKind::Throttled, ns),
-                false => self.occupant(span),
-            }
+        let idle = spans.iter().filter(|span| span.occupant == Occupant::Idle);
+        let idle_ns: u64 = idle.map(|span| span.to_ns - span.from_ns).sum();
+        if self.facts.limited && idle_ns >= IDLE_NS {
+            return self.add_kind(CauseKind::Throttled, to_ns - from_ns);
         }
+        spans.iter().for_each(|span| self.occupant(span));
     }
 
     /// Blames a timer or a sender that should have woken the thread.

@@ -112,7 +112,8 @@ mod tests {
         let usage = ThreadUsage::open();
         let before = usage.read();
         let mut pages = vec![0_u8; 4 << 20];
-        pages.iter_mut().step_by(4096).for_each(|byte| *byte = std::hint::black_box(1));
+        pages.iter_mut().step_by(4096).for_each(|byte| *byte = 1);
+        std::hint::black_box(&mut pages);
         let grown = usage.read().since(&before);
         assert!(grown.minor_faults + grown.major_faults > 0 && usage.tid() > 0, "{grown:?}");
     }
