@@ -49,7 +49,8 @@ pub fn causes(delay: &Delay) -> Vec<Cause> {
         rest.explain(CauseKind::Fault, u64::MAX);
     }
     rest.explain(CauseKind::Throttled, usage.throttled_ns);
-    rest.explain(CauseKind::Task, usage.run_delay_ns.saturating_sub(usage.throttled_ns));
+    let unusual_ns = usage.run_delay_ns.saturating_sub(usage.throttled_ns).saturating_sub(usage.usual_delay_ns);
+    rest.explain(CauseKind::Task, unusual_ns);
     if continued {
         rest.explain(CauseKind::Stopped, u64::MAX);
     }
@@ -65,6 +66,10 @@ pub fn causes(delay: &Delay) -> Vec<Cause> {
         rest.wait_ns -= taken_ns;
         rest.add(CauseKind::CoreTaken, taken_ns);
     }
+    // Usual waiting is a better guess than a cause without any sign.
+    let waited_ns = usage.usual_delay_ns.min(rest.wait_ns);
+    rest.wait_ns -= waited_ns;
+    rest.add(CauseKind::Task, waited_ns);
     // A body that did not spin before its tick overslept, or was still busy with the tick before.
     if delay.sender().is_none() && gap_end_ns == 0 {
         let rest_ns = std::mem::take(&mut rest.wait_ns);

@@ -19,9 +19,12 @@ use crate::sample::{Phase, RoleState, Schedule};
 use crate::scenario::Scenario;
 use crate::seat::{clock_path, report_path, write_whole};
 use crate::system::tell;
+use std::cmp::Reverse;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+/// The number of late ticks, the longest delays first, in the report of a role.
+const REPORTED_LATE_TICKS: usize = 20;
 /// Interval between two looks at the roles, ns.
 const LOOK_NS: u64 = 10_000_000;
 /// Interval between two looks at the schedule while none comes, ns: in real time, and in lockstep.
@@ -93,8 +96,11 @@ fn end(
     domain: &Domain,
     host: &str,
 ) -> Result<(FarEnd, (u64, u64)), LaunchError> {
-    let shutdown = supervisor.shut_down(END_LIMIT);
-    for report in &shutdown.reports {
+    let mut shutdown = supervisor.shut_down(END_LIMIT);
+    for report in &mut shutdown.reports {
+        // The connection is made for short reports.
+        report.late_ticks.sort_by_key(|late| Reverse(late.done_ns.saturating_sub(late.due_ns)));
+        report.late_ticks.truncate(REPORTED_LATE_TICKS);
         let path = report_path(domain.root(), &report.role);
         let text = serde_json::to_vec(report).expect("a report of plain values is JSON");
         write_whole(&path, &text).map_err(|source| LaunchError::Write { path, source })?;

@@ -82,7 +82,7 @@ impl LateWatch {
         let (usage, now_ns) = (self.usage.read(), monotonic_ns());
         let mut used = usage.since(&self.baseline);
         let usual_ns = self.usual_delay * now_ns.saturating_sub(self.since_ns) as f64;
-        used.run_delay_ns = used.run_delay_ns.saturating_sub(usual_ns as u64);
+        used.usual_delay_ns = (usual_ns as u64).min(used.run_delay_ns);
         let common = LateRecord {
             tid: self.usage.tid(),
             continued: take_continued(),

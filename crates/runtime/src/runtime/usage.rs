@@ -61,6 +61,7 @@ impl ThreadUsage {
         let count = |count: libc::c_long| u64::try_from(count).unwrap_or_default();
         Usage {
             run_delay_ns,
+            usual_delay_ns: 0,
             minor_faults: count(resources.ru_minflt),
             major_faults: count(resources.ru_majflt),
             preemptions: count(resources.ru_nivcsw),

@@ -57,8 +57,10 @@ pub struct LateRecord {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Usage {
-    /// Time for which it could run and waited for a core, ns; of a late tick, beyond what is usual.
+    /// Time for which it could run and waited for a core, ns.
     pub run_delay_ns: u64,
+    /// The part of that time which is usual for the thread, ns.
+    pub usual_delay_ns: u64,
     /// Page faults without input or output.
     pub minor_faults: u64,
     /// Page faults with input or output.
@@ -75,6 +77,7 @@ impl Usage {
     pub fn since(&self, earlier: &Self) -> Self {
         Self {
             run_delay_ns: self.run_delay_ns.saturating_sub(earlier.run_delay_ns),
+            usual_delay_ns: self.usual_delay_ns.saturating_sub(earlier.usual_delay_ns),
             minor_faults: self.minor_faults.saturating_sub(earlier.minor_faults),
             major_faults: self.major_faults.saturating_sub(earlier.major_faults),
             preemptions: self.preemptions.saturating_sub(earlier.preemptions),
@@ -83,7 +86,7 @@ impl Usage {
     }
 }
 
-persist_fields!(Usage, run_delay_ns, minor_faults, major_faults, preemptions, throttled_ns);
+persist_fields!(Usage, run_delay_ns, usual_delay_ns, minor_faults, major_faults, preemptions, throttled_ns);
 persist_fields!(
     LateRecord, tick, missed, starved, stalled, continued, tid, sender, due_ns, input_ns, began_ns, done_ns, slept,
     gap_ns, gap_end_ns, usage, since_ns
@@ -166,7 +169,7 @@ impl LateLog {
 }
 
 /// The number of words of a record; a test compares it with the fields.
-const RECORD_WORDS: usize = 20;
+const RECORD_WORDS: usize = 21;
 
 struct SlotWords<'a> {
     slots: &'a Slots,
