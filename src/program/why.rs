@@ -29,7 +29,7 @@ pub struct Arguments {
     #[arg(short = 'n', value_name = "COUNT", default_value = "10")]
     count: NonZeroUsize,
     /// Also write the whole run to this file, as a trace for
-    /// https://ui.perfetto.dev: late ticks, cores, samples if recorded
+    /// ui.perfetto.dev: late ticks, cores, samples if recorded
     #[arg(long, value_name = "FILE")]
     perfetto: Option<PathBuf>,
     /// Print them as one JSON object (corotate/why/v1)
