@@ -35,7 +35,7 @@ pub struct Findings {
 /// The causes of one late tick.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct Finding {
-    /// The role, as [`RoleId::number`].
+    /// The role, as [`RoleId::number`](crate::runtime::RoleId::number).
     pub role: u64,
     /// The index of its record.
     pub index: usize,
