@@ -7,6 +7,7 @@
 //! |---|---|
 //! | `record` | writes every sample of a run to a file; reads, replays, compares and exports it |
 //! | `hosts` | a run over several computers: relay, clocks, who may join; with the feature of that name |
+//! | `inputs` | changes of inputs while a run lasts |
 //! | `late` | late ticks and their causes |
 //! | `launch` | starts, supervises and ends a run; scores it |
 //! | `campaign` | one scenario run many times, varied; the table of its cases |
@@ -27,11 +28,11 @@ extern crate self as corotate;
 pub use bytemuck;
 #[doc(inline)]
 pub use corotate_core::{
-    control, estimate, fault, identify, model, observe, persist_fields, rate, role, sample, serial, state,
+    control, estimate, fault, identify, input, model, observe, persist_fields, rate, role, sample, serial, state,
 };
 #[doc(inline)]
 pub use corotate_runtime::{
-    analysis, bus, clock, config, data, files, rig, runtime, scenario, score, seat, shared, system, telemetry,
+    analysis, bus, changes, clock, config, data, files, rig, runtime, scenario, score, seat, shared, system, telemetry,
     with_shipped_rig,
 };
 use corotate_runtime::{direct, failure, panics};
@@ -46,6 +47,7 @@ pub mod doctor;
 #[cfg(feature = "foxglove")]
 pub mod foxglove;
 pub mod hosts;
+pub mod inputs;
 pub mod late;
 pub mod launch;
 mod program;

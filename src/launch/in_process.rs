@@ -4,6 +4,7 @@
 use super::incident::{Action, Incident, Incidents, RoleFailure};
 use super::{Launch, LaunchError, Outcome, Progress};
 use crate::bus::memory::MemoryBus;
+use crate::changes::ReceivedChanges;
 use crate::clock::Grid;
 use crate::config::OnFailure;
 use crate::direct::TURN_TICKS;
@@ -20,6 +21,7 @@ use std::sync::atomic::Ordering;
 
 /// Runs all roles of a scenario in turn.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
+    scenario.inputs.receive_in(ReceivedChanges::default());
     // After a panic the nodes repeat the run, and the role that panics is known.
     match panics::catch_quietly(|| run_directly(scenario, launch)) {
         Ok(Some(outcome)) => Ok(outcome),

@@ -21,9 +21,12 @@ use super::{Launch, LaunchError, Outcome, Progress};
 use crate::bus::domain::{Domain, OwnedDomain, require_files};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Signal, Write};
+use crate::changes::ReceivedChanges;
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::ClockKind;
 use crate::hosts::{NetworkStatistics, RELAY};
+use crate::input::Change;
+use crate::inputs::{InputServer, Timing};
 use crate::late::TRACER;
 use crate::record::RECORDER;
 use crate::runtime::{
@@ -34,13 +37,14 @@ use crate::sample::{Phase, RoleState, Schedule, Stamp};
 use crate::scenario::Scenario;
 use crate::scenario::scorer as open_scorer;
 use crate::score::Scorer;
-use crate::seat::{describe_seat, report_path, results_path, scenario_path, seat_path, write_whole};
+use crate::seat::{changes_path, describe_seat, report_path, results_path, scenario_path, seat_path, write_whole};
 use crate::system::tell;
 use crate::telemetry::{Grant, Ledger, Outage, RoleReport};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::os::fd::AsFd;
 use std::os::unix::ffi::OsStrExt;
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
@@ -65,6 +69,9 @@ const DEBUGGED_NS: u64 = 500_000_000;
 const RELEASE_NS: u64 = 50_000_000;
 /// Time that an external role of this host has to end after a signal ended the run: it may hang.
 const SIGNALLED_END_LIMIT: Duration = Duration::from_millis(300);
+/// Time from the receipt of a change to the first tick at which it may act, ns: longer than a role takes for a tick, and than this
+/// process is usually held up.
+const CHANGE_LEAD_NS: u64 = 3_000_000;
 /// Time without progress after which the run counts as hung, ns and periods.
 const HUNG_NS: u64 = 30_000_000_000;
 const HUNG_PERIODS: u64 = 10;
@@ -75,6 +82,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     request_short_slices();
     let owned = new_domain(scenario)?;
     let domain = owned.domain();
+    scenario.inputs.receive_in(ReceivedChanges::default());
     prepare(scenario, launch, domain)?;
     let startup_limit = Duration::from_secs_f64(scenario.startup_timeout_s);
     let mut janitor = Janitor::start(domain, startup_limit)?;
@@ -91,6 +99,12 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
         let role = report.role.clone();
         report.outages.clone().into_iter().map(move |outage| (role.clone(), outage))
     };
+    for report in shutdown.reports.iter().filter(|report| report.late_inputs > 0) {
+        let (role, count) = (&report.role, report.late_inputs);
+        tell(format_args!(
+            "corotate: {role} received {count} changes of inputs after their tick: a replay may differ from there on"
+        ));
+    }
     let outages: Vec<(String, Outage)> = shutdown.reports.iter().flat_map(role_outages).collect();
     shutdown.leave_out_partial(|role| is_external(scenario, launch, role));
     let ShutdownReport { reports, unbooked, mut problems } = shutdown;
@@ -141,6 +155,13 @@ pub(super) fn prepare(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain)
         let path = results_path(domain.root());
         write_whole(&path, results.as_os_str().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
     }
+    let path = changes_path(domain);
+    let list = ReceivedChanges::open(&path).map_err(|source| LaunchError::Write { path, source })?;
+    // A replay begins with those of the recorded run.
+    let before = scenario.inputs.received();
+    let before: Vec<Change> = (0..before.count()).filter_map(|number| before.get(number)).collect();
+    list.append(&before, || true);
+    scenario.inputs.receive_in(list);
     describe_seats(scenario, launch, domain)
 }
 
@@ -229,6 +250,9 @@ pub(super) struct Supervisor<'a> {
     foxglove: Companion,
     relay: RelayWatch,
     tracer: TracerWatch,
+    /// Absent on a host that joined: the launching host receives the changes.
+    inputs: Option<InputServer>,
+    received: Arc<ReceivedChanges>,
 }
 
 impl<'a> Supervisor<'a> {
@@ -266,6 +290,8 @@ impl<'a> Supervisor<'a> {
         members.iter_mut().zip(started).for_each(|(member, (_, process))| member.process = process);
         let externals = ExternalWatch::new(members.len());
         let (word, incidents) = (Schedule::default(), Incidents::default());
+        let path = domain.root().to_owned();
+        let inputs = Some(InputServer::start(domain).map_err(|source| LaunchError::Write { path, source })?);
         Ok(Self {
             scenario,
             domain,
@@ -279,6 +305,8 @@ impl<'a> Supervisor<'a> {
             foxglove,
             relay,
             tracer,
+            inputs,
+            received: scenario.inputs.received(),
         })
     }
 
@@ -453,6 +481,10 @@ impl<'a> Supervisor<'a> {
             let idle = scored == 0 && !(lockstep && backoff.brief());
             // Publishing wakes the roles that are far ahead: for several ticks at once, unless there is nothing else to do.
             if credit >= self.word.credit_tick + if idle { 1 } else { credit_ticks } {
+                // A change must be there before a role may come to its tick.
+                if let Some(inputs) = &mut self.inputs {
+                    inputs.append_pending(&self.received, credit + window_ticks(self.scenario));
+                }
                 self.word.credit_tick = credit;
                 self.announce()?;
             }
@@ -462,6 +494,7 @@ impl<'a> Supervisor<'a> {
                 next_look_ns = now_ns + SCORE_NS;
                 self.announce()?;
                 self.listen()?;
+                self.serve_inputs(launch);
                 let tick = scorer.next_tick();
                 if !self.supervise(&mut |id, tick| scorer.incident(id, tick), tick, now_ns)? {
                     return Ok(0);
@@ -490,6 +523,36 @@ impl<'a> Supervisor<'a> {
             }
         }
         Ok(0)
+    }
+
+    /// Serves requests to change inputs.
+    fn serve_inputs(&mut self, launch: &Launch<'_>) {
+        let (scenario, word) = (self.scenario, &self.word);
+        let period_ns = scenario.period_ns;
+        let timing = || match scenario.clock {
+            ClockKind::Realtime => {
+                let now_ns = monotonic_ns();
+                let tick_at = |ns: u64| ns.saturating_sub(word.epoch_ns).div_ceil(period_ns);
+                Timing {
+                    earliest: tick_at(now_ns + CHANGE_LEAD_NS),
+                    safe: tick_at(now_ns + CHANGE_LEAD_NS / 3),
+                    horizon: tick_at(now_ns + CHANGE_LEAD_NS + 5 * SCORE_NS),
+                    clock: Some((word.epoch_ns, period_ns, now_ns)),
+                }
+            }
+            // No role passes the credit by more than the window.
+            ClockKind::Lockstep | ClockKind::InProcess => {
+                let earliest = word.credit_tick + window_ticks(scenario) + 1;
+                Timing { earliest, safe: earliest, horizon: earliest + window_ticks(scenario), clock: None }
+            }
+        };
+        let is_absent = |role: RoleId| {
+            let name = role.name(scenario);
+            is_external(scenario, launch, name) || elsewhere(scenario, launch, name).is_some()
+        };
+        if let Some(inputs) = &mut self.inputs {
+            inputs.poll(scenario, &self.received, &timing, &is_absent);
+        }
     }
 
     /// Restarts roles that have failed, and records hosts that left; returns false if the run must end. `note` receives the number

@@ -11,6 +11,7 @@ use crate::analysis::Claim;
 use crate::config::{ClockKind, RunId};
 use crate::files;
 use crate::hosts::NetworkStatistics;
+use crate::inputs::{AppliedChange, applied};
 use crate::late::LateReport;
 use crate::record::RecordingReport;
 use crate::rig::Figure;
@@ -72,6 +73,9 @@ pub struct Summary {
     pub score: Score,
     /// Roles that failed while the ticks ran, with the reactions.
     pub incidents: Vec<Incident>,
+    /// The changes of inputs, in the order of their ticks.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub inputs: Vec<AppliedChange>,
     /// Notes on the scenario for readers of the results.
     pub notes: Vec<String>,
     /// The physical bounds against which samples are checked.
@@ -194,6 +198,7 @@ impl Summary {
             criteria,
             score: outcome.score.clone(),
             incidents: timed(scenario, &outcome.incidents),
+            inputs: applied(scenario),
             notes: scenario.notes().into_iter().chain(scenario.warnings.iter().cloned()).collect(),
             limits: scenario.rig.limits(),
             watchdog: outcome.reports.iter().find_map(|report| report.watchdog.clone()),

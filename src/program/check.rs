@@ -3,6 +3,7 @@
 use super::campaign;
 use super::output::{CommandResult, Exit, Failure, fail, say};
 use super::scenario::{Change, load};
+use super::set::tunable;
 use crate::analysis::{Claim, Reach, apart, digits};
 use crate::campaign::Campaign;
 use crate::launch::check_cores;
@@ -27,6 +28,9 @@ pub struct Arguments {
     /// Print the claims about each scenario as a line of JSON (corotate/check/v1)
     #[arg(long)]
     json: bool,
+    /// Print the keys that may change while the loop runs
+    #[arg(long, conflicts_with_all = ["resolved", "json"])]
+    tunable: bool,
 }
 
 const EXAMPLES: &str = "\
@@ -64,6 +68,9 @@ fn check_file(arguments: &Arguments, path: &Path) -> Result<String, Failure> {
     check_cores(&scenario).map_err(|error| Failure::prefixed(path.display(), error))?;
     if arguments.json {
         return Ok(json(path, &scenario));
+    }
+    if arguments.tunable {
+        return Ok(tunable(&scenario));
     }
     let mut text = format!("{}: valid\n", path.display());
     write_claims(&scenario, &mut text).expect("writing to a string does not fail");
@@ -105,6 +112,13 @@ fn json(path: &Path, scenario: &Scenario) -> String {
         "notes": scenario.notes(),
         "warnings": scenario.warnings,
         "limits": scenario.rig.limits(),
+        "inputs": scenario.inputs.infos.iter().map(|info| serde_json::json!({
+            "key": info.key,
+            "description": info.description,
+            "variability": info.variability,
+            "value": info.to_toml(&info.initial),
+            "range": [info.range.0, info.range.1],
+        })).collect::<Vec<_>>(),
         "followers": claims(scenario),
     });
     format!("{value}\n")

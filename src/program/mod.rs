@@ -33,6 +33,7 @@ mod runs;
 mod scenario;
 mod schema;
 mod seat;
+mod set;
 mod shipped;
 mod signals;
 mod sweep;
@@ -106,6 +107,10 @@ enum Command {
     Why(why::Arguments),
     /// Watch a running loop on the terminal
     Watch(watch::Arguments),
+    /// Change gains, set points and disturbances of a running loop
+    Set(set::SetArguments),
+    /// Print the present values of what can change in a running loop
+    Get(set::GetArguments),
     /// Serve a running loop to Foxglove (WebSocket)
     Foxglove(foxglove::Arguments),
     /// Join a run that another host launched
@@ -277,6 +282,8 @@ fn execute(command: Option<Command>) -> Exit {
         Some(Command::Report(arguments)) => report::report(&arguments),
         Some(Command::Why(arguments)) => why::why(&arguments),
         Some(Command::Watch(arguments)) => watch::watch(&arguments),
+        Some(Command::Set(arguments)) => set::set(&arguments),
+        Some(Command::Get(arguments)) => set::get(&arguments),
         Some(Command::Foxglove(arguments)) => foxglove::foxglove(&arguments),
         Some(Command::Join(arguments)) => hosts::join(&arguments),
         Some(Command::Relay(arguments)) => hosts::relay(&arguments),

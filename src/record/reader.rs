@@ -6,10 +6,11 @@
 //! can fill, nor use a sample whose checksum is wrong.
 
 use super::RecordError;
-use super::recorder::{END, LATE, LATE_REPORT, RUN, SCHEMA, SignalReport, layouts};
+use super::recorder::{CHANGES, END, INPUTS, LATE, LATE_REPORT, RUN, SCHEMA, SignalReport, layouts};
 use super::writer::{CHECKSUM, checksum};
 use crate::config::{RunId, ScriptedFault};
 use crate::files;
+use crate::input::{CHANGE_WORDS, Change};
 use crate::late::LateReport;
 use crate::sample::{CDR_HEADER, FieldKind, Layout, Order, Place, Stamp};
 use crate::scenario::Scenario;
@@ -68,6 +69,8 @@ pub struct Recording {
     last_tick: Option<u64>,
     /// The late ticks, as JSON.
     late: Option<String>,
+    /// The changes of inputs that the run received.
+    changes: Vec<Change>,
 }
 
 /// The reason that a file cannot be read to its end.
@@ -188,7 +191,8 @@ impl Recording {
         }
         let last_tick = ticks.into_values().filter(|tick| *tick <= info.last_tick).max();
         let late = content.metadata.get_mut(LATE).and_then(|entries| entries.remove(LATE_REPORT));
-        Ok(Self { path: path.to_owned(), info, signals, flaw, last_tick, late })
+        let changes = read_changes(&content.metadata);
+        Ok(Self { path: path.to_owned(), info, signals, flaw, last_tick, late, changes })
     }
 
     /// Returns the file's path.
@@ -274,8 +278,10 @@ impl Recording {
 
     fn parse(&self, overrides: &[String]) -> Result<Scenario, RecordError> {
         let origin = format!("{}:scenario", self.path.display());
-        Scenario::parse(&self.info.scenario, &origin, overrides)
-            .map_err(|error| RecordError::Scenario { path: self.path.clone(), source: Box::new(error) })
+        let scenario = Scenario::parse(&self.info.scenario, &origin, overrides)
+            .map_err(|error| RecordError::Scenario { path: self.path.clone(), source: Box::new(error) })?;
+        scenario.inputs.received().append(&self.changes, || true);
+        Ok(scenario)
     }
 
     /// Returns the injected faults of the scenario.
@@ -441,6 +447,18 @@ impl RunInfo {
             end: end.map(EndInfo::read),
         })
     }
+}
+
+/// Reads the changes of inputs that the run received.
+fn read_changes(metadata: &BTreeMap<String, BTreeMap<String, String>>) -> Vec<Change> {
+    let numbered = |(name, entries): (&String, &BTreeMap<String, String>)| {
+        let number: usize = name.strip_prefix(INPUTS)?.parse().ok()?;
+        let words: Vec<[u64; CHANGE_WORDS]> = serde_json::from_str(entries.get(CHANGES)?).ok()?;
+        Some((number, words))
+    };
+    let mut numbered: Vec<_> = metadata.iter().filter_map(numbered).collect();
+    numbered.sort_by_key(|(number, _)| *number);
+    numbered.iter().flat_map(|(_, words)| words).filter_map(Change::from_words).collect()
 }
 
 impl EndInfo {

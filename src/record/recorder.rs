@@ -4,6 +4,7 @@ use super::RecordError;
 use super::taps::{SignalCounters, Taps};
 use super::writer::Writer;
 use crate::bus::AnyBus;
+use crate::changes::ReceivedChanges;
 use crate::clock::monotonic_ns;
 use crate::late::LateReport;
 use crate::runtime::{RoleId, ports};
@@ -14,6 +15,7 @@ use crate::telemetry::{MachineInfo, RoleReport};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::SystemTime;
 use xxhash_rust::xxh3::xxh3_64;
 
@@ -27,6 +29,11 @@ pub const SCHEMA: &str = "corotate/recording/v2";
 pub const RUN: &str = "corotate.run";
 /// Name of the metadata record at the end.
 pub const END: &str = "corotate.end";
+/// Beginning of the names of the metadata records with changes of inputs that the run received; the number of the first one
+/// follows.
+pub const INPUTS: &str = "corotate.inputs.";
+/// The key of their JSON: a list of changes as words.
+pub const CHANGES: &str = "changes";
 /// Name of the metadata record with the late ticks, before the one at the end.
 pub const LATE: &str = "corotate.late";
 /// The key of its JSON.
@@ -146,6 +153,9 @@ pub struct Recorder {
     file: String,
     run: BTreeMap<String, String>,
     late: Option<LateReport>,
+    /// The changes of inputs that the run receives, and the number of recorded ones.
+    received: Arc<ReceivedChanges>,
+    recorded_changes: usize,
     begun: bool,
 }
 
@@ -162,6 +172,8 @@ impl Recorder {
             file: path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
             run: run_metadata(scenario),
             late: None,
+            received: scenario.inputs.received(),
+            recorded_changes: 0,
             begun: false,
         })
     }
@@ -191,9 +203,23 @@ impl Recorder {
     /// # Errors
     /// [`RecordError`]; the file can still be [finished](Self::finish).
     pub fn poll(&mut self) -> Result<u64, RecordError> {
+        self.record_changes()?;
         let taken = self.taps.drain(&mut self.writer)?;
         self.writer.close_due_chunk(monotonic_ns())?;
         Ok(taken)
+    }
+
+    /// Writes the changes of inputs that the run has received since the last call.
+    fn record_changes(&mut self) -> Result<(), RecordError> {
+        let count = self.received.count();
+        if count == self.recorded_changes || !self.begun {
+            return Ok(());
+        }
+        let new = (self.recorded_changes..count).filter_map(|number| Some(self.received.get(number)?.words()));
+        let entries = [(CHANGES.to_owned(), json(&new.collect::<Vec<_>>()))].into();
+        let name = format!("{INPUTS}{}", self.recorded_changes);
+        self.recorded_changes = count;
+        self.writer.metadata(&name, entries)
     }
 
     /// Returns the first tick that some signal still lacks.
@@ -241,6 +267,7 @@ impl Recorder {
         if !self.begun {
             self.start(0, Some(0))?;
         }
+        self.record_changes()?;
         if let Some(late) = self.late.take() {
             // Without room for them the file has no late ticks, but is whole.
             self.writer.metadata_if_room(LATE, [(LATE_REPORT.to_owned(), json(&late))].into())?;

@@ -10,6 +10,7 @@
 //! | [`sample`](mod@sample) | the fixed-size samples that roles exchange |
 //! | [`model`] | bodies and their motion |
 //! | [`fault`] | scripted faults: the affected sample or role, the kind and the tick |
+//! | [`input`] | quantities that change while a loop runs: a gain, a reference, a disturbance |
 //! | [`observe`] | invariant relations and their filters |
 //! | [`control`] | control laws and their certificates |
 //! | [`role`] | plant, observer and controller as state machines without clock and I/O |
@@ -37,6 +38,7 @@ pub mod control;
 pub mod estimate;
 pub mod fault;
 pub mod identify;
+pub mod input;
 pub mod model;
 pub mod observe;
 pub mod rate;

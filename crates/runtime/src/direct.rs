@@ -32,7 +32,7 @@ struct Judge<R: Rig> {
 fn is_plain(scenario: &Settings) -> bool {
     let watch = WatchBounds { from_tick: scenario.watch.from_tick, ..WatchBounds::NONE };
     let single = scenario.bodies.iter().all(|body| body.fleet.is_none());
-    single && scenario.faults.is_empty() && scenario.watch.max == watch.max
+    single && scenario.faults.is_empty() && scenario.inputs.is_constant() && scenario.watch.max == watch.max
 }
 
 /// Runs a scenario without a recording. Returns `None` if the nodes must run it. Every [`TURN_TICKS`] ticks it calls `proceed`
@@ -167,6 +167,7 @@ impl<'a, R: Rig> Run<'a, R> {
             grants: Vec::new(),
             line: None,
             outages: Vec::new(),
+            late_inputs: 0,
             late_ticks: Vec::new(),
         }
     }

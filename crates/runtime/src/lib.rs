@@ -26,10 +26,13 @@
 // The exported macros use paths of the facade.
 #[cfg(test)]
 extern crate corotate_core as corotate;
-use corotate_core::{control, estimate, fault, identify, model, observe, rate, role, sample, serial, state, vector};
+use corotate_core::{
+    control, estimate, fault, identify, input, model, observe, rate, role, sample, serial, state, vector,
+};
 
 pub mod analysis;
 pub mod bus;
+pub mod changes;
 pub mod clock;
 pub mod config;
 pub mod data;

@@ -4,10 +4,10 @@
 
 use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::Grid;
-use crate::config::{Accept, Settings};
+use crate::config::{Accept, InputUser, Settings};
 use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth, field_named};
 use crate::role::Guard;
-use crate::runtime::{AcceptedTicks, Input, LateSamples, Seek, topic};
+use crate::runtime::{AcceptedTicks, Input, LateSamples, RoleInputs, Seek, topic};
 use crate::sample::{Message, Sample, Stamp, status};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -247,6 +247,7 @@ struct RigScorer<R: Rig, B: Bus> {
 /// The score as it grows tick by tick, independent of how the samples arrive.
 pub(crate) struct Scoring<R: Rig> {
     rig: R,
+    inputs: RoleInputs,
     accept: Accept,
     tick_s: f64,
     delay_ticks: u64,
@@ -285,6 +286,7 @@ impl<R: Rig> Scoring<R> {
         };
         Self {
             rig: rig.clone(),
+            inputs: RoleInputs::new(&scenario.inputs, |user| user == InputUser::Score),
             accept: scenario.accept.clone(),
             tick_s: scenario.tick_s(),
             delay_ticks: scenario.actuation_delay_ticks,
@@ -322,6 +324,9 @@ impl<R: Rig> Scoring<R> {
         complete: bool,
     ) {
         let tick = self.next_tick;
+        if self.inputs.is_due(tick) {
+            self.apply_inputs(tick);
+        }
         *(if complete { &mut self.score.scored_ticks } else { &mut self.score.unscored_ticks }) += 1;
         self.rig.score(truth, fleet, estimate, &mut self.values);
         self.score.faulted_ticks += u64::from(self.values.contains(&f64::INFINITY));
@@ -346,7 +351,9 @@ impl<R: Rig> Scoring<R> {
         for driven in &mut self.driven {
             let (observed, own) = (truth(0), truth(driven.body));
             let now = match (observed, own, seen) {
-                (Some(observed), Some(own), Some(estimate)) => self.rig.true_lyapunov(observed, own, estimate),
+                (Some(observed), Some(own), Some(estimate)) => {
+                    self.rig.true_lyapunov(driven.body, observed, own, estimate)
+                }
                 _ => None,
             };
             // A follower in hold or in safe state did not apply the command that the certificate assumes.
@@ -354,6 +361,14 @@ impl<R: Rig> Scoring<R> {
             driven.judge(tick, (self.tick_s, self.delay_ticks), now, undisturbed, &mut self.score.certificate);
         }
         self.next_tick += 1;
+    }
+
+    #[cold]
+    fn apply_inputs(&mut self, tick: u64) {
+        let rig = &mut self.rig;
+        self.inputs.advance(tick, |new| rig.set_input(new.by.port, new.values));
+        // V jumps with a set point.
+        self.driven.iter_mut().for_each(|driven| driven.before = None);
     }
 
     /// Returns true if every metric with a limit is known and within it.

@@ -42,6 +42,8 @@ impl<'a> Supervisor<'a> {
             foxglove,
             relay,
             tracer: TracerWatch::none()?,
+            inputs: None,
+            received: scenario.inputs.received(),
         })
     }
 

@@ -45,6 +45,18 @@ pub struct Certificate {
     /// The factors of −e_i² and −ε² in the bound on V̇ of \[D\](18), 1/s.
     slopes: Vector3<f64>,
     hidden_slope: f64,
+    arguments: Arguments,
+}
+
+/// The arguments of [`Certificate::new`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Arguments {
+    coefficients: Vector3<f64>,
+    hidden_axis: usize,
+    gain_per_s: Vector3<f64>,
+    decay_rate_per_s: f64,
+    tick_s: f64,
+    unpredicted_ticks: u64,
 }
 
 impl Certificate {
@@ -83,7 +95,30 @@ impl Certificate {
             gain_step: Self::gain_step(gain_per_s, tick_s, unpredicted_ticks),
             slopes,
             hidden_slope: decay_rate_per_s - pull[0] - pull[1] - gain_per_s[k] / 2.0,
+            arguments: Arguments {
+                coefficients: *coefficients,
+                hidden_axis,
+                gain_per_s: *gain_per_s,
+                decay_rate_per_s,
+                tick_s,
+                unpredicted_ticks,
+            },
         }
+    }
+
+    /// Returns the certificate of the same loop with other gains or another decay rate, 1/s.
+    #[must_use]
+    pub fn with_rates(&self, gain_per_s: Option<Vector3<f64>>, decay_rate_per_s: Option<f64>) -> Self {
+        let arguments = &self.arguments;
+        Self::new(
+            &arguments.coefficients,
+            arguments.hidden_axis,
+            &gain_per_s.unwrap_or(arguments.gain_per_s),
+            decay_rate_per_s.unwrap_or(arguments.decay_rate_per_s),
+            self.rate_bound_rad_s,
+            arguments.tick_s,
+            arguments.unpredicted_ticks,
+        )
     }
 
     /// Computes V = ½(|e|² + ε²) of \[D\](15), rad²/s², and the bound on V̇ of \[D\](18), rad²/s³, for the errors e =

@@ -32,6 +32,11 @@ impl FleetLaw {
         self.law.learn(coefficients);
     }
 
+    /// Returns the law of one follower, to change its inputs.
+    pub fn synchronizer_mut(&mut self) -> &mut Synchronizer {
+        &mut self.law
+    }
+
     /// Returns true if both motions are predicted before the law is applied.
     pub fn predicts(&self) -> bool {
         self.law.lead_s() > 0.0

@@ -34,6 +34,7 @@ pub struct Synchronizer {
     body: RigidBody,
     gain_per_s: Vector3<f64>,
     lead_s: f64,
+    offset: Vector3<f64>,
 }
 
 impl Synchronizer {
@@ -42,7 +43,24 @@ impl Synchronizer {
     /// `lead_s` is the time over which both motions are predicted before the law is applied: the delay of the loop,
     /// or 0.
     pub fn new(body: RigidBody, gain_per_s: Vector3<f64>, lead_s: f64) -> Self {
-        Self { body, gain_per_s, lead_s }
+        Self { body, gain_per_s, lead_s, offset: zeros() }
+    }
+
+    /// Replaces the positive gains −k, 1/s.
+    pub fn set_gain(&mut self, gain_per_s: Vector3<f64>) {
+        self.gain_per_s = gain_per_s;
+    }
+
+    /// Sets the rate at which the follower turns relative to the leader, rad/s in the follower's axes: the law then drives
+    /// p − ω − δ to zero, at the same rates while δ is constant. \[D\] has δ = 0.
+    pub fn set_offset(&mut self, offset_rad_s: Vector3<f64>) {
+        self.offset = offset_rad_s;
+    }
+
+    /// Returns the rate relative to the leader, rad/s.
+    #[inline]
+    pub fn offset(&self) -> Vector3<f64> {
+        self.offset
     }
 
     /// Replaces the coefficients a of \[D\](2) by those that an observer has learned.
@@ -95,7 +113,7 @@ impl Synchronizer {
     #[inline]
     pub fn command(&self, w: &Vector3<f64>, p: &Vector3<f64>) -> Vector3<f64> {
         let gyroscopic = Vector3::new(w.y * w.z - p.y * p.z, w.z * w.x - p.z * p.x, w.x * w.y - p.x * p.y);
-        self.body.coefficients().component_mul(&gyroscopic) - self.gain_per_s.component_mul(&(p - w))
+        self.body.coefficients().component_mul(&gyroscopic) - self.gain_per_s.component_mul(&(p - w - self.offset))
     }
 }
 

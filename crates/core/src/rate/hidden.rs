@@ -63,6 +63,16 @@ impl HiddenObserver {
         }
     }
 
+    /// Replaces the decay rate of a first-order filter, 1/s, positive. The estimate stays.
+    pub(crate) fn set_decay_rate(&mut self, rate_per_s: f64) {
+        if let Filter::First(first) = self.filter {
+            self.filter = filter(rate_per_s, first.estimate().x);
+        }
+        if let Filter::First(first) = self.guess {
+            self.guess = filter(rate_per_s, first.estimate().x);
+        }
+    }
+
     /// Restarts from a known estimate at a known instant.
     pub(crate) fn restart(&mut self, filter: Filter<1>, at: RateSample, status: u64) {
         (self.filter, self.innovation, self.status) = (filter, 0.0, status);

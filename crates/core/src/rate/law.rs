@@ -1,5 +1,6 @@
 //! The synchronising law of one follower, which also computes its certificate at every tick.
 
+use super::port;
 use crate::control::{Certificate, InFlightCommands, InertiaAdaptation, Synchronizer, limited};
 use crate::role::Law;
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement};
@@ -105,8 +106,25 @@ impl Law for RateLaw {
             *sent = out.acceleration_rad_s2;
         }
         // e = p − ω with ω = ω̂ + ε; the observer knows ε from its last step.
-        let error = follower - reference - self.supplied * estimate.innovation_rad_s;
+        let error = follower - reference - self.law.offset() - self.supplied * estimate.innovation_rad_s;
         (out.lyapunov_rad2_s2, out.lyapunov_rate_bound_rad2_s3) =
             self.certificate.map_or((0.0, 0.0), |certificate| certificate.lyapunov(&error, estimate.innovation_rad_s));
+    }
+
+    fn set_input(&mut self, port: usize, values: &[f64]) {
+        let vector = || Vector3::from_iterator(values.iter().copied());
+        let (mut gain_per_s, mut decay_rate_per_s) = (None, None);
+        match (port, values) {
+            (port::GAIN, [_, _, _]) => {
+                self.law.set_gain(vector());
+                gain_per_s = Some(vector());
+            }
+            (port::OFFSET, [_, _, _]) => self.law.set_offset(vector()),
+            (port::DECAY, [rate]) => decay_rate_per_s = Some(*rate),
+            _ => {}
+        }
+        if let Some(certificate) = &mut self.certificate {
+            *certificate = certificate.with_rates(gain_per_s, decay_rate_per_s);
+        }
     }
 }

@@ -2,6 +2,7 @@
 
 use super::hidden::{ALL, HiddenObserver, KnownBody, finite, seen};
 use super::learner::Learner;
+use super::port;
 use crate::observe::{GuardedKalman, RateNoise, RateSample};
 use crate::role::Estimator;
 use crate::sample::{RateEstimate, RateMeasurement, status};
@@ -64,6 +65,12 @@ impl Estimator for RateObserver {
             Self::Hidden(observer) => observer.coast(dt_s),
             Self::Kalman(observer) => observer.coast(dt_s),
             Self::Learner(_) => {}
+        }
+    }
+
+    fn set_input(&mut self, port: usize, values: &[f64]) {
+        if let (Self::Hidden(observer), port::DECAY, [rate]) = (self, port, values) {
+            observer.set_decay_rate(*rate);
         }
     }
 

@@ -16,6 +16,9 @@ pub trait Law {
 
     /// Writes the command, but not the stamp.
     fn command(&mut self, estimate: &Self::Estimate, measurement: &Self::Measurement, out: &mut Self::Command);
+    /// Takes new values of an input of the loop, such as a gain or a reference, from this tick on. `port` is the number that the
+    /// rig gave to it.
+    fn set_input(&mut self, _port: usize, _values: &[f64]) {}
 }
 
 /// A law for one follower that also stamps its commands.
@@ -28,6 +31,11 @@ impl<L: Law> Controller<L> {
     /// Creates a controller for one follower.
     pub fn new(law: L) -> Self {
         Self { law }
+    }
+
+    /// Passes new values of an input to the law.
+    pub fn set_input(&mut self, port: usize, values: &[f64]) {
+        self.law.set_input(port, values);
     }
 
     /// Computes command k from estimate k and measurement k. The caller sets the stamp's `generation` and `sent_ns`.

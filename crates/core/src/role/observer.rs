@@ -26,6 +26,9 @@ pub trait Estimator {
     fn coast(&mut self, _dt_s: f64) {}
     /// Writes the estimate with the given additional status bits, but not the stamp.
     fn write(&self, status: u64, out: &mut Self::Estimate);
+    /// Takes new values of an input of the loop, such as a decay rate, from this tick on. `port` is the number that the rig gave to
+    /// it.
+    fn set_input(&mut self, _port: usize, _values: &[f64]) {}
 
     /// Updates the estimate with a usable measurement taken `dt_s` seconds after the last one and writes it, if the
     /// estimator has a fast path for this step. Returns false, with nothing changed, if it has none. The result is
@@ -86,6 +89,11 @@ impl<E: Estimator> Observer<E> {
     /// Creates an observer at its initial guess. `tick_s` is the period h in seconds.
     pub fn new(estimator: E, tick_s: f64) -> Self {
         Self { estimator, tick_s, last: None, last_output: 0 }
+    }
+
+    /// Passes new values of an input to the estimator.
+    pub fn set_input(&mut self, port: usize, values: &[f64]) {
+        self.estimator.set_input(port, values);
     }
 
     /// Computes estimate k from measurement k. The caller sets the stamp's `generation` and `sent_ns`.

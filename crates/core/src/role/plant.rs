@@ -26,6 +26,9 @@ pub trait Body {
     fn measure(&mut self, tick: u64, status: u64, out: &mut Self::Measurement);
     /// Moves the body by `dt_s` seconds under the held input.
     fn flow(&mut self, dt_s: f64);
+    /// Takes new values of an input of the loop, such as a disturbance, from this tick on. `port` is the number that the rig gave
+    /// to it. Called before everything else of the tick.
+    fn set_input(&mut self, _port: usize, _values: &[f64]) {}
 }
 
 /// A single body, not a fleet: the size of its samples is known at compile time.
@@ -88,6 +91,8 @@ pub struct Plant<B> {
     tick_s: f64,
     missing_ticks: u64,
     safe: bool,
+    /// True while a switch demands the safe command.
+    demanded_safe: bool,
     /// True if the command of this tick arrived and was not accepted.
     rejected: bool,
 }
@@ -95,7 +100,7 @@ pub struct Plant<B> {
 impl<B: Body> Plant<B> {
     /// Creates a plant at its initial state. `tick_s` is the period h in seconds.
     pub fn new(body: B, actuation: Actuation, tick_s: f64) -> Self {
-        Self { body, actuation, tick_s, missing_ticks: 0, safe: false, rejected: false }
+        Self { body, actuation, tick_s, missing_ticks: 0, safe: false, demanded_safe: false, rejected: false }
     }
 
     /// Returns true if the plant takes commands.
@@ -115,7 +120,7 @@ impl<B: Body> Plant<B> {
             return CommandEvent::NotDue;
         }
         self.rejected = false;
-        let latched = self.safe && self.actuation.rearm == Rearm::Manual;
+        let latched = self.safe && (self.actuation.rearm == Rearm::Manual || self.demanded_safe);
         match command.filter(|command| command.stamp().tick == tick - self.actuation.delay_ticks) {
             Some(_) if latched => CommandEvent::Refused,
             Some(command) if self.body.apply(command) => {
@@ -138,6 +143,21 @@ impl<B: Body> Plant<B> {
     /// Returns the number of further ticks without a command until the safe command acts; 0 if it acts now.
     pub fn ticks_until_safe(&self) -> u64 {
         if self.safe { 0 } else { self.actuation.timeout_ticks.saturating_sub(self.missing_ticks).max(1) }
+    }
+
+    /// Passes new values of an input to the body.
+    pub fn set_input(&mut self, port: usize, values: &[f64]) {
+        self.body.set_input(port, values);
+    }
+
+    /// Applies the safe command until this is called with `false`, which also ends a safe command that is latched.
+    pub fn demand_safe(&mut self, safe: bool) {
+        self.demanded_safe = safe;
+        if safe {
+            self.expire();
+        } else {
+            (self.safe, self.missing_ticks) = (false, 0);
+        }
     }
 
     /// Applies the safe command at once, as after the command timeout.
@@ -223,6 +243,7 @@ impl<B: Persist> Persist for Plant<B> {
         self.body.persist(words);
         self.missing_ticks.persist(words);
         self.safe.persist(words);
+        self.demanded_safe.persist(words);
         self.rejected.persist(words);
     }
 }

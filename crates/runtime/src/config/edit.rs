@@ -40,6 +40,14 @@ impl Document {
         self.refuse_absurd_value(&copy, path.to_owned())
     }
 
+    /// Returns the document without a top-level key.
+    #[must_use]
+    pub fn without(&self, key: &str) -> Self {
+        let mut rest = self.clone();
+        rest.table.remove(key);
+        rest
+    }
+
     /// Removes the table at a top-level key and returns it as a document.
     pub fn take(&mut self, key: &str) -> Option<Self> {
         let Some(Value::Table(_)) = self.table.get(key) else { return None };

@@ -4,6 +4,7 @@
 
 use super::fault::RawFault;
 use super::hosts::{Host, Network};
+use super::input::RawInput;
 use crate::role::Rearm;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -41,6 +42,8 @@ pub(crate) struct Raw {
     pub host: Vec<Host>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub fault: Vec<RawFault>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub input: Vec<RawInput>,
 }
 
 fn default_seed() -> u64 {
@@ -81,6 +84,8 @@ pub(crate) struct Actuator {
     pub command_timeout_ticks: u64,
     #[serde(with = "RearmName")]
     pub rearm: Rearm,
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub safe: bool,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -92,7 +97,7 @@ enum RearmName {
 
 impl Default for Actuator {
     fn default() -> Self {
-        Self { command_timeout_ticks: 20, rearm: Rearm::Auto }
+        Self { command_timeout_ticks: 20, rearm: Rearm::Auto, safe: false }
     }
 }
 

@@ -4,6 +4,7 @@ use super::accept::Accept;
 use super::body::{BodyInfo, role_names};
 use super::fault::ScriptedFault;
 use super::hosts::Hosts;
+use super::input::Inputs;
 use super::raw::{ClockKind, Realtime, Supervision, Trace};
 use super::run_id::RunId;
 use crate::bus::Port;
@@ -51,6 +52,8 @@ pub struct Settings {
     pub hosts: Hosts,
     /// The faults to inject.
     pub faults: Vec<ScriptedFault>,
+    /// The inputs, and their changes.
+    pub inputs: Inputs,
     /// The bounds that the controller watches.
     pub watch: WatchBounds,
     /// The acceptance criteria.

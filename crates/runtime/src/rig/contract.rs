@@ -4,7 +4,7 @@
 
 use super::fleet::Fleet;
 use super::pictures::{Picture, graphs};
-use crate::config::{BodyInfo, Checks, ConfigError, Document};
+use crate::config::{BodyInfo, Checks, ConfigError, Document, InputInfo};
 use crate::role::{Actuation, Body, Controller, Estimator, Guard, Law, LoopBody, LoopControl, Plant, SingleBody};
 use crate::sample::FleetSample;
 use crate::state::Persist;
@@ -145,6 +145,12 @@ pub trait Rig: Clone + Send + Sync + 'static {
     fn isolated(&self, _index: usize, _start: Start, _noisy: bool) -> Option<Self> {
         None
     }
+    /// Returns the scenario keys that may change while the loop runs.
+    fn inputs(&self) -> Vec<InputInfo> {
+        Vec::new()
+    }
+    /// Takes new values of an input that the score uses, from this tick on. `port` is the number in [`inputs`](Rig::inputs).
+    fn set_input(&mut self, _port: usize, _values: &[f64]) {}
     /// Returns the proofs about the closed loop, one per driven body.
     fn certificates(&self) -> Vec<CertificateReport> {
         Vec::new()
@@ -153,10 +159,11 @@ pub trait Rig: Clone + Send + Sync + 'static {
     fn undisturbed(_truth: &Truth<Self>) -> bool {
         true
     }
-    /// Returns V and the bound on V̇ for a driven body, from the truths of the observed and the driven body and from the estimate.
+    /// Returns V and the bound on V̇ for the driven body with an index, from the truths of the observed and the driven body and from the estimate.
     /// Returns `None` if the rig has no Lyapunov function.
     fn true_lyapunov(
         &self,
+        _index: usize,
         _observed: &Truth<Self>,
         _driven: &Truth<Self>,
         _estimate: &Estimate<Self>,

@@ -3,7 +3,7 @@
 //! This file does nothing that a [`Rig`] implementation could not do.
 
 use super::{BodyInfo, Context, Estimate, FleetTruth, Measurement, Monitor, NoFleet, Picture, Rig, Truth, graphs};
-use crate::config::{Checks, ConfigError, Document, keys_of};
+use crate::config::{Checks, ConfigError, Document, InputInfo, keys_of};
 use crate::role::{Body, Estimator, Guard, Law, Refusal, SingleBody};
 use crate::sample::{Field, FieldKind, Message, Sample};
 use crate::state::{Persist, Words};
@@ -162,6 +162,11 @@ pub trait SimpleRig: Serialize + DeserializeOwned + Clone + Send + Sync + 'stati
     fn law(&self, index: usize) -> Self::Law;
     /// Returns the largest permitted magnitude per field name. Guards reject samples beyond it, and samples with NaN or infinity.
     fn bounds(&self) -> Vec<(&'static str, f64)> {
+        Vec::new()
+    }
+    /// Returns the scenario keys that may change while the loop runs, with the users of each: the body, the estimator and the law
+    /// receive new values by their `set_input`.
+    fn inputs(&self) -> Vec<InputInfo> {
         Vec::new()
     }
     /// Returns the quantities that the controller can watch.
@@ -357,6 +362,10 @@ impl<R: SimpleRig> Rig for R {
     fn limits(&self) -> Vec<super::Figure> {
         let figure = |(field, bound): (&str, f64)| super::Figure { name: format!("|{field}|"), value: bound };
         self.bounds().into_iter().map(figure).collect()
+    }
+
+    fn inputs(&self) -> Vec<InputInfo> {
+        SimpleRig::inputs(self)
     }
 
     fn monitors() -> &'static [Monitor<Self>] {

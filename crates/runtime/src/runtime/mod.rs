@@ -18,6 +18,7 @@ mod privileges;
 mod role_function;
 mod role_id;
 mod role_impl;
+mod role_inputs;
 mod sample_source;
 mod usage;
 
@@ -47,6 +48,7 @@ pub use privileges::{
 pub use role_function::{RoleFunction, TickSamples};
 pub use role_id::RoleId;
 pub use role_impl::RoleImpl;
+pub use role_inputs::{NewValue, RoleInputs};
 pub use usage::{ThreadUsage, watch_continued};
 
 use crate::bus::Depths;

@@ -28,6 +28,7 @@ use super::role_impl::RoleImpl;
 use super::sample_source::{DeviceHandle, SampleSource};
 use crate::bus::iox::{COMMON_BYTES, footprint};
 use crate::bus::{Bus, BusError, Port, Signal};
+use crate::changes::ReceivedChanges;
 use crate::clock::Clock;
 use crate::config::{ClockKind, Settings};
 use crate::control::Watchdog;
@@ -82,7 +83,11 @@ pub fn shared_memory_bytes(scenario: &Settings) -> usize {
     };
     let Ports { schedule, health, .. } = ports(scenario, RoleId::Observer);
     // The recorder publishes health too.
-    COMMON_BYTES + port(&schedule) + port(&health) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
+    COMMON_BYTES
+        + ReceivedChanges::BYTES
+        + port(&schedule)
+        + port(&health)
+        + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
 }
 
 /// Returns the report of a role: the counters in its ledger, with the stages and grants that the role adds.
@@ -124,6 +129,7 @@ pub fn report(
         grants,
         line: None,
         outages: Vec::new(),
+        late_inputs: 0,
         late_ticks: late_log(scenario, role, ledger).map_or_else(Vec::new, |log| log.records(0).collect()),
     }
 }

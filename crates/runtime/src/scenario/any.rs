@@ -4,7 +4,7 @@
 
 use crate::analysis::{self, Claim};
 use crate::bus::{AnyBus, BusError};
-use crate::config::{BodyInfo, Settings, role_names};
+use crate::config::{BodyInfo, InputInfo, Settings, role_names};
 use crate::direct;
 use crate::rig::{CertificateReport, Figure, Picture, Rig, WordView};
 use crate::runtime::{ReadyNode, RoleImpl, build_rig};
@@ -25,6 +25,8 @@ pub trait AnyRig: WordView + Any + Send + Sync {
     fn limits(&self) -> Vec<Figure>;
     /// Returns the quantities that the controller can watch. A reason is given for each that cannot be watched in this scenario.
     fn monitors(&self) -> Vec<(&'static str, Option<&'static str>)>;
+    /// Returns the scenario keys that may change while the loop runs.
+    fn inputs(&self) -> Vec<InputInfo>;
     /// Returns notes for readers of the results.
     fn notes(&self) -> Vec<String>;
     /// Returns the pictures of the motion in a report.
@@ -79,6 +81,10 @@ impl<R: Rig> AnyRig for R {
 
     fn monitors(&self) -> Vec<(&'static str, Option<&'static str>)> {
         R::monitors().iter().map(|monitor| (monitor.name, (monitor.absent)(self))).collect()
+    }
+
+    fn inputs(&self) -> Vec<InputInfo> {
+        Rig::inputs(self)
     }
 
     fn notes(&self) -> Vec<String> {

@@ -23,8 +23,8 @@ use crate::config::accept::{self, Accept};
 use crate::config::hosts::{self, Hosts};
 use crate::config::raw::{Launch, Policy, Raw};
 use crate::config::{
-    Checks, ClockKind, ConfigError, Cores, Document, NotExternal, Realtime, Settings, Shape, Supervision, fault,
-    nearest, watchdog,
+    BodyInfo, Checks, ClockKind, ConfigError, Cores, Document, InputInfo, InputUse, InputUser, Inputs, NotExternal,
+    Realtime, Settings, Shape, Supervision, Variability, fault, input, nearest, watchdog,
 };
 use crate::control::{ACTUATION_DELAY_MAX, WatchBounds};
 use crate::rig::Context;
@@ -108,6 +108,8 @@ impl Scenario {
     /// # Errors
     /// [`ConfigError`].
     pub fn resolve(mut document: Document) -> Result<Self, ConfigError> {
+        // Changes are checked by resolving the scenario with their values.
+        let without_changes = document.has("input").then(|| document.without("input"));
         document.refuse_lists(&[&registry::tables()[..], &TABLES].concat())?;
         let sections = document.split_off(&registry::sections());
         let maxima: Maxima = document.split_off_within("watchdog", |key| key.ends_with("_max")).read_into()?;
@@ -149,6 +151,7 @@ impl Scenario {
         let hosts = Hosts { hosts: raw.host.clone(), network: raw.network.clone() };
         hosts::check_alone(&hosts, &raw.launch.processes, &raw.launch.external, &mut checks);
         let (mut faults, mut watch, mut signals) = (Vec::new(), WatchBounds::NONE, Vec::new());
+        let mut inputs = Inputs::default();
         if let Some(rig) = &rig {
             let bodies: Vec<(&str, bool)> = rig.bodies().iter().map(|body| (&*body.name, body.driven)).collect();
             hosts::check(&hosts, &bodies, &rig.roles(), actuation_delay_ticks, &mut checks);
@@ -164,6 +167,12 @@ impl Scenario {
                 actuation_delay_ticks,
             };
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
+            inputs.infos = rig.inputs();
+            inputs.infos.extend(safe_switch(&raw, rig.bodies()));
+            let probe =
+                |key: &str, value| without_changes.as_ref().map_or_else(Vec::new, |base| mistakes(base, key, value));
+            let setting = input::Setting { infos: &inputs.infos, tick_s, last_tick, seed: raw.seed, probe: &probe };
+            inputs.scripted = input::resolve(&raw.input, &setting, &mut checks).into();
             watch =
                 watchdog::resolve(&raw.watchdog, &maxima.watchdog, &rig.monitors(), tick_s, duration_s, &mut checks);
         }
@@ -196,6 +205,7 @@ impl Scenario {
             supervision: raw.supervision,
             hosts,
             faults,
+            inputs,
             watch,
             accept,
             run: document.run(),
@@ -225,6 +235,34 @@ impl Scenario {
     /// Returns the scenario as the text of a file.
     pub fn to_toml(&self) -> String {
         toml::to_string(&self.resolved).expect("a scenario of plain values is TOML")
+    }
+}
+
+/// Returns the switch that demands the safe command of every driven body; `None` if the scenario drives no body.
+fn safe_switch(raw: &Raw, bodies: &[BodyInfo]) -> Option<InputInfo> {
+    let driven = bodies.iter().enumerate().filter(|(_, body)| body.driven);
+    let uses: Vec<_> = driven.map(|(index, _)| InputUse { user: InputUser::Actuator(index), port: 0 }).collect();
+    (!uses.is_empty()).then(|| InputInfo {
+        key: "actuator.safe".to_owned(),
+        description: "actuators apply the safe command; false re-arms them".into(),
+        variability: Variability::Switch,
+        initial: vec![f64::from(u8::from(raw.actuator.safe))],
+        range: (0.0, 1.0),
+        uses,
+    })
+}
+
+/// Returns the mistakes of a scenario in which a key has another value: reason and code of each.
+fn mistakes(base: &Document, key: &str, value: toml::Value) -> Vec<(String, &'static str)> {
+    let mut changed = base.clone();
+    let place = changed.place(key);
+    let resolved = changed.put(key, value, &place).and_then(|()| Scenario::resolve(changed));
+    let Err(error) = resolved else { return Vec::new() };
+    match error {
+        ConfigError::Invalid { problems } => {
+            problems.into_iter().map(|problem| (format!("{}: {}", problem.key, problem.reason), problem.code)).collect()
+        }
+        error => error.mistakes(),
     }
 }
 

@@ -5,6 +5,7 @@
 use crate::bus::domain::{Domain, DomainError, domains};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Reader, Signal};
+use crate::changes::ReceivedChanges;
 use crate::clock::{self, Grid, monotonic_ns, sleep_until};
 use crate::config::{ClockKind, ConfigError, Realtime, Settings, Wake};
 use crate::files;
@@ -150,6 +151,15 @@ pub enum RoleError {
         /// The system's reason.
         source: io::Error,
     },
+    /// The list of received changes cannot be read.
+    #[error("cannot read the changes of inputs in {}: {source}; {}", path.display(), remedy(source))]
+    #[strum(serialize = "no-changes")]
+    Changes {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
     /// The report could not be written.
     #[error("cannot write the report {}: {source}; {}", path.display(), remedy(source))]
     #[strum(serialize = "cannot-write")]
@@ -164,6 +174,14 @@ pub enum RoleError {
 /// Returns the file in a domain with the scenario of its run.
 pub fn scenario_path(domain: &Domain) -> PathBuf {
     domain.root().join("scenario.toml")
+}
+
+/// Returns the scenario of the run in a domain's directory, without joining the run.
+///
+/// # Errors
+/// [`ConfigError`].
+pub fn scenario_of(root: &Path) -> Result<Scenario, ConfigError> {
+    Scenario::load(&root.join("scenario.toml"), &[])
 }
 
 /// Returns the file in a domain's directory for a role's report.
@@ -266,6 +284,11 @@ pub(super) fn require_process(scenario: &Settings, role: RoleId) -> Result<(), R
     if host == role { Ok(()) } else { Err(RoleError::Hosted { role: name(role), host: name(host) }) }
 }
 
+/// Returns the file with the changes of inputs that a run has received.
+pub fn changes_path(domain: &Domain) -> PathBuf {
+    domain.shared(ReceivedChanges::FILE)
+}
+
 /// Returns the file with the correction of this host's clock, in a run that was launched on another host.
 pub fn clock_path(domain: &Domain) -> PathBuf {
     domain.shared("clock")
@@ -277,6 +300,11 @@ pub fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
     let path = clock_path(&domain);
     clock::adopt(&path).map_err(|source| RoleError::Clock { path, source })?;
     let scenario = Scenario::load(&scenario_path(&domain), &[])?;
+    let path = changes_path(&domain);
+    if path.exists() {
+        let list = ReceivedChanges::open(&path).map_err(|source| RoleError::Changes { path, source })?;
+        scenario.inputs.receive_in(list);
+    }
     Ok((domain, scenario))
 }
 
@@ -428,8 +456,8 @@ pub fn serve<B: Bus + 'static>(
         let grants = if *member == role { privileges.grants.clone() } else { Vec::new() };
         let node = node.member(*member).unwrap_or(&*node);
         stages.extend(node.stages());
-        let (line, outages) = (node.line(), node.outages());
-        deliver(&RoleReport { line, outages, ..report(scenario, *member, ledger, stages, grants) })?;
+        let (line, outages, late_inputs) = (node.line(), node.outages(), node.late_inputs());
+        deliver(&RoleReport { line, outages, late_inputs, ..report(scenario, *member, ledger, stages, grants) })?;
     }
     // Samples may still wait in queues: the links stay open until all readers are done.
     if ended == Ended::Finished {

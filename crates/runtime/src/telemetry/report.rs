@@ -30,9 +30,16 @@ pub struct RoleReport {
     /// The times in which that device was absent.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub outages: Vec<Outage>,
+    /// The number of changes of inputs that it applied after their tick, because it received them too late.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub late_inputs: u64,
     /// The records of its late ticks, in real time; at most as many as a ledger keeps.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub late_ticks: Vec<LateRecord>,
+}
+
+fn is_zero(count: &u64) -> bool {
+    *count == 0
 }
 
 /// A time in which a device did not answer.

@@ -41,6 +41,8 @@ pub(super) struct RawLeader {
     pub noise_rad_s: [f64; 3],
     #[serde(default)]
     pub bias_rad_s: [f64; 3],
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub disturbance_rad_s2: [f64; 3],
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub outage: Vec<RawOutage>,
 }
@@ -77,6 +79,14 @@ pub(super) struct RawFollower {
     pub noise_rad_s: [f64; 3],
     #[serde(default)]
     pub bias_rad_s: [f64; 3],
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub offset_rad_s: [f64; 3],
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub disturbance_rad_s2: [f64; 3],
+}
+
+fn is_zero(vector: &[f64; 3]) -> bool {
+    *vector == [0.0; 3]
 }
 
 fn identical() -> [f64; 3] {
@@ -94,9 +104,10 @@ impl RawFollower {
         self.initial_rate_spread_rad_s.unwrap_or_default()
     }
 
-    /// Returns a bound on the initial rates of all bodies, rad/s.
+    /// Returns a bound on the initial rates of all bodies and on their rates relative to the leader, rad/s.
     pub fn fastest(&self) -> Vector3<f64> {
-        Vector3::from(self.initial_rate_rad_s).abs() + Vector3::from(self.spread_rad_s())
+        let initial = Vector3::from(self.initial_rate_rad_s).abs() + Vector3::from(self.spread_rad_s());
+        initial.sup(&Vector3::from(self.offset_rad_s).abs())
     }
 }
 
@@ -295,6 +306,7 @@ fn check_fleets(raw: &Raw, checks: &mut Checks<'_>) {
             ("inertia_factor", follower.inertia_factor == identical()),
             ("noise_rad_s", follower.noise_rad_s == [0.0; 3]),
             ("bias_rad_s", follower.bias_rad_s == [0.0; 3]),
+            ("disturbance_rad_s2", follower.disturbance_rad_s2 == [0.0; 3]),
         ] {
             checks.require(plain, &key(name), "fleet-key", || {
                 "is not supported for a fleet, whose bodies equal the leader and are measured without error; remove it or count"

@@ -38,6 +38,9 @@ pub struct RigidBodyRig {
     pub(super) noise: Vec<Noise<3>>,
     pub(super) deviations_rad_s: Vec<Vector3<f64>>,
     pub(super) biases_rad_s: Vec<Vector3<f64>>,
+    /// Per body: its rate relative to the leader, rad/s, and the disturbance that acts on it, rad/s².
+    pub(super) offsets_rad_s: Vec<Vector3<f64>>,
+    pub(super) disturbances_rad_s2: Vec<Vector3<f64>>,
     pub(super) limits: Limits,
     pub(super) notes: Vec<String>,
     pub(super) tick_s: f64,

@@ -7,6 +7,7 @@ use super::RigidBodyRig;
 use super::limits::Motion;
 use crate::control::{FleetLaw, InFlightCommands};
 use crate::model::{RigidBody, flow_all, uniform};
+use crate::rate::port;
 use crate::rig::Fleet;
 use crate::role::{Body, Bounds, Guard, Law, MotionCheck, Refusal};
 use crate::sample::{
@@ -68,7 +69,7 @@ pub struct RateFleet {
 impl RateFleet {
     /// Creates the fleet of `count` bodies that takes the place of the body with this index.
     pub(super) fn new(rig: &RigidBodyRig, index: usize, count: usize) -> Self {
-        let (law, controller) = rig.synchronizer();
+        let (law, controller) = rig.synchronizer(index);
         let acceleration_max_rad_s2 = rig.limits.acceleration_rad_s2;
         let mut draw = uniform(rig.seed, STREAMS | index as u64);
         let (centre, spread) = (rig.initial_rates[index], rig.spreads[index]);
@@ -232,6 +233,15 @@ impl Law for FleetRateLaw {
             }
         } else {
             self.law.command(&reference, rates, out.vector_mut(ACCELERATION));
+        }
+    }
+
+    fn set_input(&mut self, port: usize, values: &[f64]) {
+        let law = self.law.synchronizer_mut();
+        match (port, values) {
+            (port::GAIN, &[x, y, z]) => law.set_gain(Vector3::new(x, y, z)),
+            (port::OFFSET, &[x, y, z]) => law.set_offset(Vector3::new(x, y, z)),
+            _ => {}
         }
     }
 }

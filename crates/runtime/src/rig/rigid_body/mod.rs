@@ -7,6 +7,7 @@
 mod config;
 mod design;
 mod fleet;
+mod inputs;
 mod limits;
 mod plant;
 mod playback;
@@ -24,7 +25,7 @@ use super::{
     BodyInfo, CertificateReport, ConditionReport, Context, Figure, Graph, Inputs, Lyapunov, Monitor, Picture, Plane,
     Rig, Start, Watched,
 };
-use crate::config::{Checks, ConfigError, Document};
+use crate::config::{Checks, ConfigError, Document, InputInfo};
 use crate::control::{Certificate, Synchronizer};
 use crate::model::{Inertia, Noise, RigidBody};
 use crate::observe::RateNoise;
@@ -121,13 +122,15 @@ impl RigidBodyRig {
         }
     }
 
-    /// Returns the law that all followers share, and its parameters.
-    fn synchronizer(&self) -> (Synchronizer, ControllerDesign) {
+    /// Returns the law of a follower, and its parameters.
+    fn synchronizer(&self, index: usize) -> (Synchronizer, ControllerDesign) {
         let Some(controller) = self.controller else {
             unreachable!("a scenario with a follower has a controller: checked when it was resolved")
         };
         let lead_s = if controller.predict { self.tick_s } else { 0.0 };
-        (Synchronizer::new(RigidBody::new(&self.inertia), controller.gain_per_s, lead_s), controller)
+        let mut law = Synchronizer::new(RigidBody::new(&self.inertia), controller.gain_per_s, lead_s);
+        law.set_offset(self.offsets_rad_s[index]);
+        (law, controller)
     }
 
     /// Returns the delay that the law does not predict, ticks.
@@ -261,6 +264,7 @@ impl Rig for RigidBodyRig {
             outages: if index == 0 { self.outages.clone() } else { Vec::new() },
             playback: self.playback.clone().filter(|_| index == 0),
             played_s: 0.0,
+            resistance_rad_s2: plant::resistance(&self.disturbances_rad_s2[index]),
         }
     }
 
@@ -289,8 +293,8 @@ impl Rig for RigidBodyRig {
         }
     }
 
-    fn law(&self, _index: usize) -> RateLaw {
-        let (law, controller) = self.synchronizer();
+    fn law(&self, index: usize) -> RateLaw {
+        let (law, controller) = self.synchronizer(index);
         RateLaw::new(&RateLawDesign {
             law,
             adaptation_gain: controller.adaptation_gain,
@@ -325,6 +329,14 @@ impl Rig for RigidBodyRig {
         self.limits.figures()
     }
 
+    fn inputs(&self) -> Vec<InputInfo> {
+        inputs::inputs(self)
+    }
+
+    fn set_input(&mut self, port: usize, values: &[f64]) {
+        inputs::set(self, port, values);
+    }
+
     fn monitors() -> &'static [Monitor<Self>] {
         &MONITORS
     }
@@ -350,10 +362,15 @@ impl Rig for RigidBodyRig {
             _ => f64::NAN,
         };
         let leader = rate(0);
-        let follower = |index: usize| match (self.bodies[index].fleet, leader) {
-            (None, _) => distance(rate(index), leader),
-            (Some(_), Some(leader)) => fleet(index).map_or(f64::NAN, |truth| farthest(truth.vector(0), &leader)),
-            (Some(_), None) => f64::NAN,
+        let follower = |index: usize| {
+            let reference = leader.map(|leader| leader + self.offsets_rad_s[index]);
+            match (self.bodies[index].fleet, reference) {
+                (None, _) => distance(rate(index), reference),
+                (Some(_), Some(reference)) => {
+                    fleet(index).map_or(f64::NAN, |truth| farthest(truth.vector(0), &reference))
+                }
+                (Some(_), None) => f64::NAN,
+            }
         };
         let worst = |worst: f64, error: f64| if error > worst || error.is_nan() { error } else { worst };
         let value = |metric| match metric {
@@ -378,6 +395,9 @@ impl Rig for RigidBodyRig {
             noise: pair(&self.noise, index),
             deviations_rad_s: pair(&self.deviations_rad_s, index),
             biases_rad_s: pair(&self.biases_rad_s, index),
+            // The rate of convergence depends on neither.
+            offsets_rad_s: vec![Vector3::zeros(); 2],
+            disturbances_rad_s2: vec![Vector3::zeros(); 2],
             ..self.clone()
         };
         rig.bodies.iter_mut().for_each(|body| body.fleet = None);
@@ -460,7 +480,18 @@ impl Rig for RigidBodyRig {
     }
 
     #[inline]
-    fn true_lyapunov(&self, leader: &RateTruth, follower: &RateTruth, estimate: &RateEstimate) -> Option<(f64, f64)> {
+    fn true_lyapunov(
+        &self,
+        index: usize,
+        leader: &RateTruth,
+        follower: &RateTruth,
+        estimate: &RateEstimate,
+    ) -> Option<(f64, f64)> {
+        // The bound covers neither disturbances nor, in the sampled loop, a follower that is held off the leader's motion.
+        let disturbed = [0, index].iter().any(|body| self.disturbances_rad_s2[*body] != Vector3::zeros());
+        if disturbed || self.offsets_rad_s[index] != Vector3::zeros() {
+            return None;
+        }
         let (rate, own) = (Vector3::from(leader.omega_rad_s), Vector3::from(follower.omega_rad_s));
         let hidden_error = rate[self.supplied()] - estimate.omega_rad_s[self.supplied()];
         Some(self.certificate?.lyapunov(&(own - rate), hidden_error))

@@ -2,6 +2,7 @@
 
 use super::playback::Playback;
 use crate::model::{Noise, RigidBody};
+use crate::rate::port;
 use crate::role::Body;
 use crate::sample::{RateCommand, RateMeasurement, RateTruth};
 use crate::state::persist_fields;
@@ -35,6 +36,13 @@ pub struct RatePlant {
     /// The motion that it plays back instead of moving freely, and the time played so far, s.
     pub(super) playback: Option<Arc<Playback>>,
     pub(super) played_s: f64,
+    /// The disturbance with the opposite sign, rad/s². Subtracting zero leaves every bit of a number as it is; adding it does not.
+    pub(super) resistance_rad_s2: Vector3<f64>,
+}
+
+/// Returns a disturbance with the opposite sign; zero is positive.
+pub(super) fn resistance(disturbance_rad_s2: &Vector3<f64>) -> Vector3<f64> {
+    disturbance_rad_s2.map(|component| 0.0 - component)
 }
 
 impl RatePlant {
@@ -100,7 +108,13 @@ impl Body for RatePlant {
                 self.played_s += dt_s;
                 playback.at(self.played_s)
             }
-            None => self.body.flow(&self.rate, &self.acceleration(), dt_s),
+            None => self.body.flow(&self.rate, &(self.acceleration() - self.resistance_rad_s2), dt_s),
         };
+    }
+
+    fn set_input(&mut self, port: usize, values: &[f64]) {
+        if let (port::DISTURBANCE, &[x, y, z]) = (port, values) {
+            self.resistance_rad_s2 = resistance(&Vector3::new(x, y, z));
+        }
     }
 }

@@ -57,6 +57,8 @@ pub(super) fn resolve(
         noise: vec![noise(context, 0, raw.leader.noise_rad_s, raw.leader.bias_rad_s)],
         deviations_rad_s: vec![raw.leader.noise_rad_s.into()],
         biases_rad_s: vec![raw.leader.bias_rad_s.into()],
+        offsets_rad_s: vec![Vector3::zeros()],
+        disturbances_rad_s2: vec![raw.leader.disturbance_rad_s2.into()],
         limits: design_limits(
             &raw,
             leader_bound_rad_s(&raw.leader, &inertia, playback.as_deref()),
@@ -81,6 +83,8 @@ pub(super) fn resolve(
         rig.noise.push(noise(context, index as u64 + 1, follower.noise_rad_s, follower.bias_rad_s));
         rig.deviations_rad_s.push(follower.noise_rad_s.into());
         rig.biases_rad_s.push(follower.bias_rad_s.into());
+        rig.offsets_rad_s.push(follower.offset_rad_s.into());
+        rig.disturbances_rad_s2.push(follower.disturbance_rad_s2.into());
     }
     rig.check_tick(checks);
     Ok((Some(rig), table))

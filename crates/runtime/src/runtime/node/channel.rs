@@ -4,11 +4,13 @@ use super::context::NodeContext;
 use super::missed::MissedTicks;
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
+use crate::config::InputUser;
 use crate::rig::{BodyInfo, Estimate, Fleet, Rig};
 use crate::role::{Controller, Guard, Law};
 use crate::runtime::error::NodeError;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::runtime::role_id::RoleId;
+use crate::runtime::role_inputs::NewValue;
 use crate::runtime::sample_source::SampleSource;
 use crate::sample::Message;
 use crate::state::{Persist, Words};
@@ -40,6 +42,11 @@ impl<R: Rig, B: Bus> Channels<R, B> {
     pub fn iter_mut(&mut self) -> impl Iterator<Item = &mut dyn AnyChannel<Estimate<R>>> {
         let single = self.single.iter_mut().map(|channel| channel as &mut dyn AnyChannel<_>);
         single.chain(self.fleets.iter_mut().map(|channel| channel as &mut dyn AnyChannel<_>))
+    }
+
+    /// Passes new values of an input to the law that uses it.
+    pub fn set_input(&mut self, new: NewValue<'_>) {
+        self.iter_mut().for_each(|channel| channel.set_input(new));
     }
 }
 
@@ -87,6 +94,8 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
 pub trait AnyChannel<E> {
     /// Accepts the samples that a predecessor has already used.
     fn expect_repeats(&mut self);
+    /// Passes new values of an input to the law, if it is for this body.
+    fn set_input(&mut self, new: NewValue<'_>);
     /// Sets the time grid and the first tick that counts.
     fn start(&mut self, clock: Clock, grid: Grid, next: u64);
     /// Looks for the measurement of a tick; returns true once it has arrived or is known to be missing.
@@ -128,6 +137,12 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
 {
     fn expect_repeats(&mut self) {
         self.measurement.expect_repeats();
+    }
+
+    fn set_input(&mut self, new: NewValue<'_>) {
+        if new.by.user == InputUser::Law(self.body) {
+            self.controller.set_input(new.by.port, new.values);
+        }
     }
 
     fn start(&mut self, clock: Clock, grid: Grid, next: u64) {

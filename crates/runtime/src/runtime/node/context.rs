@@ -3,11 +3,12 @@
 use super::ports::{ports, topic};
 use crate::bus::{Bus, BusError, Carried, Port, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
-use crate::config::{BodyInfo, ClockKind, Settings};
+use crate::config::{BodyInfo, ClockKind, InputUser, Settings};
 use crate::role::Guard;
 use crate::runtime::disturb::{Disturbance, Interruptions, LateSamples, extra_samples, late_samples};
 use crate::runtime::link::{AcceptedTicks, Extent, Input, Output, RetainedSamples};
 use crate::runtime::role_id::RoleId;
+use crate::runtime::role_inputs::RoleInputs;
 use crate::runtime::window_ticks;
 use crate::state::{Persist, StoredWords};
 use crate::telemetry::{LateLog, Ledger, TickCounters};
@@ -87,6 +88,11 @@ impl<B: Bus> NodeContext<'_, B> {
         let alone = self.role.process_role(self.scenario).process_members(self.scenario).len() == 1;
         let output = if alone { output } else { output.latest_first() };
         Ok(output.with_markers(self.scenario.clock != ClockKind::Realtime).disturbed(disturbance))
+    }
+
+    /// Returns the inputs of the users for which `uses` returns true.
+    pub(super) fn inputs(&self, uses: impl Fn(InputUser) -> bool) -> RoleInputs {
+        RoleInputs::new(&self.scenario.inputs, uses)
     }
 
     pub(super) fn interruptions(&self) -> Interruptions {

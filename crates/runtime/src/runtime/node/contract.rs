@@ -108,6 +108,10 @@ pub trait Node {
     fn line(&self) -> Option<LineCounters> {
         None
     }
+    /// Returns the number of changes of inputs that acted after their tick.
+    fn late_inputs(&self) -> u64 {
+        0
+    }
     /// Returns the outages of that device.
     fn outages(&self) -> Vec<Outage> {
         Vec::new()

@@ -7,6 +7,7 @@ use super::persistent::{Inherited, Persistent, commit, commit_last, length, rest
 use super::ports::driven;
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
+use crate::config::InputUser;
 use crate::control::Watchdog;
 use crate::rig::{BodyInfo, Command, Estimate, Fleet, FleetCommand, Rig, Watched};
 use crate::runtime::disturb::Interruptions;
@@ -14,6 +15,7 @@ use crate::runtime::error::NodeError;
 use crate::runtime::hooks::{self, Failpoint};
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::runtime::role_id::RoleId;
+use crate::runtime::role_inputs::RoleInputs;
 use crate::runtime::sample_source::{Progress, SampleSource};
 use crate::sample::Message;
 use crate::serial::LineCounters;
@@ -29,6 +31,7 @@ pub struct ControllerNode<R: Rig, B: Bus> {
     counters: TickCounters,
     watchdog: Watchdog,
     interruptions: Interruptions,
+    inputs: RoleInputs,
     ledger: Ledger,
     /// The source of the commands, if not the laws.
     source: Option<SampleSource>,
@@ -63,6 +66,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             counters: TickCounters::default(),
             watchdog: Watchdog::new(context.scenario.watch),
             interruptions: context.interruptions(),
+            inputs: context.inputs(|user| matches!(user, InputUser::Law(_))),
             ledger: context.ledger.reopened(),
             source,
             look: 0,
@@ -229,6 +233,10 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             }
         }
         hooks::at(Failpoint::Computing);
+        if self.inputs.is_due(stamp.tick) {
+            let channels = &mut self.channels;
+            self.inputs.advance(stamp.tick, |new| channels.set_input(new));
+        }
         if self.watchdog.active() {
             self.watch();
         }
@@ -284,6 +292,8 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
             self.estimate.expect(AcceptedTicks::Due(grid));
             self.source.iter_mut().for_each(|source| source.start(grid));
         }
+        let channels = &mut self.channels;
+        self.inputs.resume(self.counters.next(), |new| channels.set_input(new));
         self.dispatch()?;
         self.finish_commands()?;
         let next = self.counters.next();
@@ -375,6 +385,10 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     fn ticks(&self) -> Ticks {
         self.counters.report()
+    }
+
+    fn late_inputs(&self) -> u64 {
+        self.inputs.late()
     }
 
     #[inline]

@@ -6,6 +6,7 @@ use super::missed::MissedTicks;
 use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
+use crate::config::InputUser;
 use crate::rig::{Estimate, Measurement, Rig};
 use crate::role::Observer;
 use crate::runtime::disturb::Interruptions;
@@ -13,6 +14,7 @@ use crate::runtime::error::NodeError;
 use crate::runtime::hooks::{self, Failpoint};
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::runtime::role_id::RoleId;
+use crate::runtime::role_inputs::RoleInputs;
 use crate::runtime::sample_source::{Progress, SampleSource};
 use crate::sample::Message;
 use crate::serial::LineCounters;
@@ -37,6 +39,7 @@ pub struct ObserverNode<R: Rig, B: Bus> {
     clock: Clock,
     counters: TickCounters,
     interruptions: Interruptions,
+    inputs: RoleInputs,
     ledger: Ledger,
     /// The source of the estimate, if not the observer.
     source: Option<SampleSource>,
@@ -59,6 +62,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
             clock: context.clock,
             counters: TickCounters::default(),
             interruptions: context.interruptions(),
+            inputs: context.inputs(|user| user == InputUser::Observer),
             ledger: context.ledger.reopened(),
             source,
             instants: Instants::default(),
@@ -92,6 +96,10 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
             }
         }
         hooks::at(Failpoint::Computing);
+        if self.inputs.is_due(stamp.tick) {
+            let observer = &mut self.observer;
+            self.inputs.advance(stamp.tick, |new| observer.set_input(new.by.port, new.values));
+        }
         let (observer, source, clock) = (&mut self.observer, &self.source, self.clock);
         let mut done = 0;
         self.estimate.stage(|sample| {
@@ -173,6 +181,8 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
             self.measurement.expect(AcceptedTicks::Due(grid));
             self.source.iter_mut().for_each(|source| source.start(grid));
         }
+        let observer = &mut self.observer;
+        self.inputs.resume(self.counters.next(), |new| observer.set_input(new.by.port, new.values));
         self.estimate.dispatch()?;
         self.estimate.finish()?;
         self.missed.start(self.clock, grid, self.counters.next());
@@ -258,6 +268,10 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
 
     fn ticks(&self) -> Ticks {
         self.counters.report()
+    }
+
+    fn late_inputs(&self) -> u64 {
+        self.inputs.late()
     }
 
     #[inline]

@@ -6,6 +6,7 @@ use super::missed::MissedTicks;
 use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Carried, Reader, Signal};
 use crate::clock::{Clock, Grid};
+use crate::config::InputUser;
 use crate::rig::{BodyInfo, DelayLine, Due};
 use crate::role::{Body, CommandEvent, Guard, Plant};
 use crate::runtime::disturb::Interruptions;
@@ -13,6 +14,7 @@ use crate::runtime::error::NodeError;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::runtime::role_function::FunctionRole;
 use crate::runtime::role_id::RoleId;
+use crate::runtime::role_inputs::{NewValue, RoleInputs};
 use crate::sample::{Message, Stamp};
 use crate::state::{Persist, Words};
 use crate::telemetry::{LateRecord, LateTicks, Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
@@ -36,6 +38,7 @@ pub struct PlantNode<P: LinkedBody, G, B: Bus> {
     last_tick: u64,
     counters: TickCounters,
     interruptions: Interruptions,
+    inputs: RoleInputs,
     ledger: Ledger,
     /// The function that computes the samples, if not the body.
     function: Option<FunctionRole>,
@@ -81,6 +84,12 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             last_tick: scenario.last_tick,
             counters: TickCounters::default(),
             interruptions: context.interruptions(),
+            inputs: match context.role {
+                RoleId::Plant(index) => {
+                    context.inputs(|user| user == InputUser::Body(index) || user == InputUser::Actuator(index))
+                }
+                _ => context.inputs(|_| false),
+            },
             ledger: context.ledger.reopened(),
             function,
             inherited: Inherited::Nothing,
@@ -202,6 +211,10 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         self.plant.advance_alone_to(tick, std::mem::take(&mut self.behind));
         let missed = self.missed.before(tick);
         self.enter_missed(missed, now_ns);
+        if self.inputs.is_due(tick) {
+            let plant = &mut self.plant;
+            self.inputs.advance(tick, |new| set_input(plant, new));
+        }
         let event = self.take_command(tick)?;
         if self.clock == Clock::Monotonic {
             self.enter_age(event, now_ns);
@@ -262,6 +275,13 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     }
 }
 
+fn set_input<P: LinkedBody>(plant: &mut Plant<P>, new: NewValue<'_>) {
+    match new.by.user {
+        InputUser::Actuator(_) => plant.demand_safe(new.values[0] != 0.0),
+        _ => plant.set_input(new.by.port, new.values),
+    }
+}
+
 /// Returns the command that is due at a tick.
 #[inline]
 fn due<'a, S: Carried + ?Sized, G: Guard<S>, B: Bus>(
@@ -308,6 +328,8 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P
         if let (Some(command), Clock::Monotonic) = (&mut self.command, self.clock) {
             command.expect(AcceptedTicks::Due(grid));
         }
+        let plant = &mut self.plant;
+        self.inputs.resume(self.counters.next(), |new| set_input(plant, new));
         if self.inherited != Inherited::Nothing {
             self.take_over()?;
         }
@@ -404,6 +426,10 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P
 
     fn ticks(&self) -> Ticks {
         self.counters.report()
+    }
+
+    fn late_inputs(&self) -> u64 {
+        self.inputs.late()
     }
 
     #[inline]

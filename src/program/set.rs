@@ -1,0 +1,175 @@
+//! `corotate set` and `corotate get`: change inputs of a running loop, and print their values.
+
+use super::output::{CommandResult, Exit, Failure, fail, harmless, say};
+use super::runs;
+use crate::config::{Document, Variability};
+use crate::inputs::{Answer, InputError, Request, Tuned, WantedChange, current, request};
+use crate::scenario::Scenario;
+use crate::seat::scenario_of;
+use std::fmt::Write;
+use std::path::Path;
+use toml::Value;
+
+/// Options of `corotate set`.
+#[derive(clap::Args)]
+#[command(after_long_help = SET_EXAMPLES)]
+pub struct SetArguments {
+    /// The run (its directory or domain; default: the newest), then the
+    /// inputs to change, all at the same tick
+    #[arg(required = true, value_name = "[RUN] KEY=VALUE")]
+    words: Vec<String>,
+    /// The tick from which the changes act [default: the earliest]
+    #[arg(long, value_name = "TICK")]
+    at: Option<u64>,
+    /// Change the values linearly over this time, s
+    #[arg(long, value_name = "SECONDS", default_value = "0", value_parser = seconds)]
+    ramp: f64,
+    /// Set values with which the loop does not converge
+    #[arg(long)]
+    force: bool,
+    /// Print the answer as a line of JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Options of `corotate get`.
+#[derive(clap::Args)]
+#[command(after_long_help = GET_EXAMPLES)]
+pub struct GetArguments {
+    /// The run (its directory or domain; default: the newest), then the keys
+    /// to print [default: all]
+    #[arg(value_name = "[RUN] KEY")]
+    words: Vec<String>,
+    /// Print the values as a line of JSON
+    #[arg(long)]
+    json: bool,
+}
+
+const SET_EXAMPLES: &str = "\
+`corotate get` lists the inputs of a run, `corotate check --tunable` those of a
+scenario. A change acts in every role at the same tick, is part of the run's
+recording, and is replayed with it.
+
+Examples:
+  corotate set controller.gain_per_s=[6,6,6]
+  corotate set follower.0.offset_rad_s=[0,0,0.2] --ramp 2
+  corotate set runs/pair actuator.safe=true --at 5000";
+
+const GET_EXAMPLES: &str = "\
+Examples:
+  corotate get                     all inputs of the newest run
+  corotate get controller.gain_per_s --json";
+
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(seconds) if (0.0..=1e9).contains(&seconds) => Ok(seconds),
+        _ => Err("give a time of 0 s or more".to_owned()),
+    }
+}
+
+/// Changes inputs of a running loop.
+pub fn set(arguments: &SetArguments) -> CommandResult {
+    let (run, assignments) = split(&arguments.words, |word| word.contains('='));
+    let root = runs::domain(run.map(Path::new))?;
+    let changes = assignments.iter().map(|word| wanted(word, arguments.ramp)).collect::<Result<Vec<_>, _>>();
+    let changes = changes.map_err(|failure| fail(Exit::Usage, failure))?;
+    let answer = change(&root, changes.clone(), arguments).map_err(|error| fail(exit_of(&error), failure(&error)))?;
+    if arguments.json {
+        return say(&format!("{}\n", serde_json::to_string(&answer).expect("plain values are JSON")));
+    }
+    let Answer::Accepted { tick, time_s, delay_ms } = answer else {
+        return Err(fail(Exit::Failure, Failure::new("malformed", "the launcher's answer has no tick")));
+    };
+    let delay = delay_ms.map_or(String::new(), |delay_ms| format!(", {delay_ms:.1} ms after the request"));
+    let mut text = String::new();
+    for WantedChange { key, value, .. } in &changes {
+        writeln!(text, "{key} = {value} from tick {tick} ({time_s:.3} s){delay}").expect("writing to a string works");
+    }
+    say(&harmless(&text))
+}
+
+/// Checks the changes against the run's scenario and its present values, then asks for them.
+fn change(root: &Path, changes: Vec<WantedChange>, arguments: &SetArguments) -> Result<Answer, InputError> {
+    let scenario = scenario_of(root)?;
+    for change in &changes {
+        let refused = |reason| InputError::Refused { code: "not-tunable".to_owned(), reason };
+        scenario.inputs.find(&change.key).map_err(refused)?;
+    }
+    let (_, values) = current(root)?;
+    Tuned::new(&scenario, &values)?.check(&changes, arguments.force)?;
+    request(root, &Request::Set { changes, at_tick: arguments.at })
+}
+
+/// Prints the values of inputs of a running loop.
+pub fn get(arguments: &GetArguments) -> CommandResult {
+    let is_key = |word: &str| word.contains('.') && !word.contains('/') && !Path::new(word).exists();
+    let (run, keys) = split(&arguments.words, is_key);
+    let root = runs::domain(run.map(Path::new))?;
+    let shown = scenario_of(&root).map_err(InputError::from).and_then(|scenario| Ok((scenario, current(&root)?)));
+    let (scenario, (tick, mut values)) = shown.map_err(|error| fail(exit_of(&error), failure(&error)))?;
+    if !keys.is_empty() {
+        let found = keys.iter().map(|key| scenario.inputs.find(key).map(|(_, info)| info.key.clone()));
+        let found = found.collect::<Result<Vec<_>, _>>();
+        let found = found.map_err(|reason| fail(Exit::Usage, Failure::new("not-tunable", reason)))?;
+        values.retain(|key, _| found.contains(key));
+    }
+    if arguments.json {
+        return say(&format!("{}\n", serde_json::json!({ "tick": tick, "values": values })));
+    }
+    let lines: String = values.iter().map(|(key, value)| format!("{key} = {value}\n")).collect();
+    say(&harmless(&lines))
+}
+
+/// Returns the lines that `corotate check --tunable` prints: the inputs of a scenario with their meaning and range.
+pub fn tunable(scenario: &Scenario) -> String {
+    let inputs = &scenario.inputs.infos;
+    if inputs.is_empty() {
+        return "nothing in this scenario can change while it runs\n".to_owned();
+    }
+    let line = |info: &crate::config::InputInfo| {
+        let variability = match info.variability {
+            Variability::Tunable => "tunable",
+            Variability::Input => "input",
+            Variability::Switch => "switch",
+        };
+        let range = match (info.variability, info.range) {
+            (Variability::Switch, _) => String::new(),
+            (_, (least, f64::INFINITY)) => format!(", above {least}"),
+            (_, (least, largest)) => {
+                format!(", {} to {}", crate::analysis::digits(least), crate::analysis::digits(largest))
+            }
+        };
+        let (key, value) = (&info.key, info.to_toml(&info.initial));
+        format!("{key} = {value}\n  {variability}{range}: {}\n", info.description)
+    };
+    inputs.iter().map(line).collect()
+}
+
+/// Splits the words of a command into the run, if the first word is one, and the rest.
+fn split(words: &[String], is_rest: impl Fn(&str) -> bool) -> (Option<&str>, &[String]) {
+    match words.split_first() {
+        Some((first, rest)) if !is_rest(first) => (Some(first), rest),
+        _ => (None, words),
+    }
+}
+
+/// Reads an assignment such as `controller.gain_per_s=[6,6,6]`.
+fn wanted(word: &str, ramp_s: f64) -> Result<WantedChange, Failure> {
+    let mut document = Document::parse("", "set").map_err(Failure::from)?;
+    let (key, text) = word.split_once('=').unwrap_or((word, ""));
+    let refuse = |_| Failure::new("no-value", format!("{word}: the value is neither TOML nor a word; write key=value"));
+    document.set(&format!("value={text}")).map_err(refuse)?;
+    let value = document.get("value").cloned().unwrap_or(Value::Boolean(false));
+    Ok(WantedChange { key: key.trim().replace('[', ".").replace(']', ""), value, ramp_s })
+}
+
+fn failure(error: &InputError) -> Failure {
+    Failure::new(error.code(), error)
+}
+
+fn exit_of(error: &InputError) -> Exit {
+    match error {
+        InputError::Unreachable { .. } | InputError::Malformed { .. } => Exit::Failure,
+        _ => Exit::Usage,
+    }
+}
