@@ -27,11 +27,7 @@ pub struct AppliedChange {
 
 /// Returns the changes of a run up to its last tick, in the order of their ticks.
 pub fn applied(scenario: &Settings) -> Vec<AppliedChange> {
-    let (inputs, list) = (&scenario.inputs, scenario.inputs.received());
-    let received = (0..list.count()).filter_map(|number| list.get(number)).map(|change| (change, true));
-    let scripted = inputs.scripted.iter().map(|change| (*change, false));
-    let mut all: Vec<(Change, bool)> = scripted.chain(received).collect();
-    all.sort_by_key(|(change, _)| change.tick);
+    let inputs = &scenario.inputs;
     let described = |(change, received): (Change, bool)| {
         let info = inputs.infos.get(change.input)?;
         (change.tick <= scenario.last_tick).then(|| AppliedChange {
@@ -44,7 +40,7 @@ pub fn applied(scenario: &Settings) -> Vec<AppliedChange> {
             received,
         })
     };
-    all.into_iter().filter_map(described).collect()
+    inputs.lists().all().into_iter().filter_map(described).collect()
 }
 
 fn name(shape: &Shape) -> &'static str {

@@ -90,7 +90,7 @@ impl InputServer {
         self.append_pending(list, timing().horizon);
         while let Ok((request, reply)) = self.requests.try_recv() {
             let answer = match &request {
-                Request::Get => values(scenario, list, timing().earliest),
+                Request::Get => values(scenario, timing().earliest),
                 Request::Set { changes, at_tick } => {
                     self.set(scenario, list, timing, is_absent, changes, *at_tick).unwrap_or_else(|refusal| refusal)
                 }
@@ -196,9 +196,9 @@ fn answer(stream: &UnixStream, requests: &SyncSender<Waiting>) -> io::Result<()>
 }
 
 /// Returns the values of all inputs at a tick.
-fn values(scenario: &Settings, list: &ReceivedChanges, tick: u64) -> Answer {
+fn values(scenario: &Settings, tick: u64) -> Answer {
     let inputs = &scenario.inputs;
-    let values = inputs.values_at(list, tick);
+    let values = inputs.lists().values_at(&inputs.infos, tick);
     let values = inputs.infos.iter().zip(values).map(|(info, values)| (info.key.clone(), info.to_toml(&values)));
     Answer::Values { tick, values: values.collect() }
 }

@@ -7,6 +7,7 @@ use super::{Action, Outcome};
 use crate::config::{ClockKind, TickAmount, TickLimit};
 use crate::fault::{Action as FaultAction, Interruption};
 use crate::scenario::Scenario;
+use crate::score::StepResponse;
 use crate::telemetry::{Percentiles, Ticks};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
@@ -18,6 +19,18 @@ const NOTICED_S: f64 = 0.1;
 
 /// A criterion on a latency: key, stage and figure.
 type LatencyCriterion = (&'static str, &'static str, fn(&Percentiles) -> f64);
+
+/// A criterion on a response to a step: key, figure, and true if it applies to set points only.
+type ResponseCriterion = (&'static str, fn(&StepResponse) -> Option<f64>, bool);
+
+/// The criteria on responses.
+const RESPONSES: [ResponseCriterion; 5] = [
+    ("rise_time_s_max", |response| response.rise_time_s, true),
+    ("overshoot_max", |response| response.overshoot, true),
+    ("settling_time_s_max", |response| response.settling_time_s, false),
+    ("steady_state_error_max", |response| Some(response.steady_state_error), false),
+    ("command_peak_max", |response| response.command_max, false),
+];
 
 /// The criteria on latencies. Step and age are those of observer and controller: a body's age includes the time until its command
 /// is due.
@@ -80,6 +93,8 @@ pub enum Unjudged {
     Unscored(u64, u64, f64),
     /// The role keeps no counters.
     Unbooked,
+    /// No input made such a step.
+    NoStep,
     /// A reason read back from a summary.
     Recorded(String),
 }
@@ -94,6 +109,7 @@ impl fmt::Display for Unjudged {
                 write!(f, "{unscored} of {ticks} ticks from {from_s} s on were not scored")
             }
             Self::Unbooked => f.write_str("the role keeps no counters"),
+            Self::NoStep => f.write_str("no input made such a step"),
             Self::Recorded(reason) => f.write_str(reason),
         }
     }
@@ -171,6 +187,7 @@ impl Judge<'_> {
             criteria.push(Criterion::new("unscored_ticks_max", limit, Some(unscored as f64)));
         }
         criteria.extend(accept.latency_max_us.iter().map(|(key, limit)| self.latency(key, *limit)));
+        criteria.extend(accept.response_max.iter().map(|(key, limit)| self.response(key, *limit)));
         criteria
     }
 
@@ -186,6 +203,17 @@ impl Judge<'_> {
         let reason = (self.scenario.clock != ClockKind::Realtime).then_some(Unjudged::Clock);
         let criterion = Criterion::new(key, limit, worst.map(|(_, us)| us)).unless(reason);
         Criterion { role: worst.map(|(role, _)| role.clone()), ..criterion }
+    }
+
+    /// Judges the response with the largest figure. One without the figure, such as one that does not settle, does not hold.
+    fn response(&self, key: &str, limit: f64) -> Criterion {
+        let (_, figure, set_points) = RESPONSES[RESPONSES.iter().position(|(name, ..)| *name == key).unwrap_or(0)];
+        let responses = self.outcome.score.responses.iter();
+        let judged = responses.filter(|response| !set_points || response.overshoot.is_some());
+        let figures: Vec<Option<f64>> = judged.map(figure).collect();
+        let all: Option<Vec<f64>> = figures.iter().copied().collect();
+        let worst = all.and_then(|all| all.into_iter().max_by(f64::total_cmp));
+        Criterion::new(key, limit, worst).unless(figures.is_empty().then_some(Unjudged::NoStep))
     }
 
     fn metrics(&self) -> Vec<Criterion> {

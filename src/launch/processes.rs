@@ -155,14 +155,19 @@ pub(super) fn prepare(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain)
         let path = results_path(domain.root());
         write_whole(&path, results.as_os_str().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
     }
+    share_changes(scenario, domain)?;
+    describe_seats(scenario, launch, domain)
+}
+
+/// Moves the list of received changes into a domain; that of a replay has those of the recorded run.
+pub(super) fn share_changes(scenario: &Scenario, domain: &Domain) -> Result<(), LaunchError> {
     let path = changes_path(domain);
     let list = ReceivedChanges::open(&path).map_err(|source| LaunchError::Write { path, source })?;
-    // A replay begins with those of the recorded run.
     let before = scenario.inputs.received();
     let before: Vec<Change> = (0..before.count()).filter_map(|number| before.get(number)).collect();
     list.append(&before, || true);
     scenario.inputs.receive_in(list);
-    describe_seats(scenario, launch, domain)
+    Ok(())
 }
 
 fn is_external(scenario: &Scenario, launch: &Launch<'_>, role: &str) -> bool {

@@ -5,6 +5,7 @@
 use super::LaunchError;
 use super::children::{END_LIMIT, RoleProcess};
 use super::janitor::Janitor;
+use super::processes::share_changes;
 use crate::bus::domain::OwnedDomain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
@@ -39,6 +40,7 @@ pub fn replay_as_process(
     let path = scenario_path(domain);
     write_whole(&path, without_interruptions(scenario).as_bytes())
         .map_err(|source| LaunchError::Write { path, source })?;
+    share_changes(scenario, domain)?;
     let _janitor = Janitor::start(domain, Duration::from_secs_f64(scenario.startup_timeout_s))?;
     let bus = IoxBus::enter(domain, "replay", depths(scenario))?;
     let mut prompter = Prompter {

@@ -19,6 +19,8 @@ const NO_FAULT: &str = "; no fault";
 /// Lines of late ticks by cause, by default and with all.
 const LATE_LINES: usize = 3;
 const LATE_LINES_ALL: usize = 8;
+/// Responses to steps that are shown by default.
+const RESPONSES: usize = 4;
 /// Incidents that are shown by default.
 const INCIDENTS: usize = 4;
 
@@ -44,6 +46,7 @@ pub fn table(summary: &Summary, all: bool) -> String {
         let _ = writeln!(text, "note: {note}");
     }
     results(summary, all, &mut text);
+    responses(summary, if all { usize::MAX } else { RESPONSES }, &mut text);
     let shown = if all { usize::MAX } else { INCIDENTS };
     text.push_str(if summary.incidents.is_empty() { "" } else { "\n" });
     for incident in summary.incidents.iter().take(shown) {
@@ -159,6 +162,36 @@ fn results(summary: &Summary, all: bool, text: &mut String) {
     for (signal, statuses) in &summary.score.statuses {
         let statuses: Vec<String> = statuses.iter().map(|(name, ticks)| format!("{name} at {ticks}")).collect();
         let _ = writeln!(text, "{signal}: {} of {} ticks", statuses.join(", "), summary.last_tick + 1);
+    }
+}
+
+/// Writes the responses to steps of inputs, and the number of all changes.
+fn responses(summary: &Summary, most: usize, text: &mut String) {
+    let responses = &summary.score.responses;
+    if !responses.is_empty() {
+        let mut table = plain(&["response to a step", "at", "rise", "over", "settled", "error", "command"]);
+        for response in responses.iter().take(most) {
+            let dash = || "-".to_owned();
+            let seconds = |time_s: Option<f64>| time_s.map_or_else(dash, |time_s| format!("{} s", digits(time_s)));
+            table.add_row([
+                format!("{}[{}]", response.key, response.component),
+                seconds(Some(response.time_s)),
+                seconds(response.rise_time_s),
+                response.overshoot.map_or_else(dash, |part| format!("{:.1} %", 100.0 * part)),
+                seconds(response.settling_time_s),
+                format!("{:.1e}", response.steady_state_error),
+                response.command_max.map_or_else(dash, |command| format!("{command:.1e}")),
+            ]);
+        }
+        let _ = writeln!(text, "\n{table}");
+        if responses.len() > most {
+            let _ = writeln!(text, "{} more responses: -v shows them", responses.len() - most);
+        }
+    }
+    let received = summary.inputs.iter().filter(|change| change.received).count();
+    if !summary.inputs.is_empty() {
+        let scripted = summary.inputs.len() - received;
+        let _ = writeln!(text, "changes of inputs: {scripted} of the scenario, {received} received");
     }
 }
 

@@ -10,6 +10,7 @@ mod fleet;
 mod hil;
 #[cfg(feature = "hosts")]
 mod hosts;
+mod inputs;
 mod late;
 mod one_process;
 mod own_rig;

@@ -2,13 +2,19 @@
 //!
 //! Must not delay the loop, except through the ticks that it permits in lockstep.
 
+mod response;
+
+pub use response::StepResponse;
+
 use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::Grid;
-use crate::config::{Accept, InputUser, Settings};
+use crate::config::{Accept, ChangeLists, InputInfo, InputUser, ResponseField, Settings};
+use crate::input::Shape;
 use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth, field_named};
 use crate::role::Guard;
 use crate::runtime::{AcceptedTicks, Input, LateSamples, RoleInputs, Seek, topic};
 use crate::sample::{Message, Sample, Stamp, status};
+use response::Responses;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -30,6 +36,9 @@ pub struct Score {
     pub received: Vec<(String, u64)>,
     /// Per signal and status bit, the number of ticks with this bit set; zero counts are left out.
     pub statuses: BTreeMap<String, BTreeMap<String, u64>>,
+    /// The responses to steps of set points and disturbances.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub responses: Vec<StepResponse>,
     /// Recovery time per incident number, s: from the incident's tick until every metric with a limit stays within it, to the end or
     /// to the next incident.
     #[serde(skip)]
@@ -137,6 +146,12 @@ fn status_of<S: Sample>(sample: &S) -> u64 {
         Some(index) => sample.words()[S::FIELDS[index].offset / size_of::<u64>()],
         None => 0,
     }
+}
+
+/// Returns an element of a numeric field of a sample.
+fn number<S: Sample>(sample: &S, name: &str, element: usize) -> Option<f64> {
+    let field = S::FIELDS.iter().find(|field| field.name == name && element < field.count)?;
+    sample.words().get(field.offset / size_of::<u64>() + element).map(|bits| f64::from_bits(*bits))
 }
 
 /// The number of a signal's samples with each status bit set.
@@ -248,6 +263,9 @@ struct RigScorer<R: Rig, B: Bus> {
 pub(crate) struct Scoring<R: Rig> {
     rig: R,
     inputs: RoleInputs,
+    infos: Vec<InputInfo>,
+    changes: ChangeLists,
+    responses: Responses,
     accept: Accept,
     tick_s: f64,
     delay_ticks: u64,
@@ -286,7 +304,10 @@ impl<R: Rig> Scoring<R> {
         };
         Self {
             rig: rig.clone(),
-            inputs: RoleInputs::new(&scenario.inputs, |user| user == InputUser::Score),
+            inputs: RoleInputs::new(&scenario.inputs, |_| true),
+            infos: scenario.inputs.infos.clone(),
+            changes: scenario.inputs.lists(),
+            responses: Responses::new(scenario.tick_s()),
             accept: scenario.accept.clone(),
             tick_s: scenario.tick_s(),
             delay_ticks: scenario.actuation_delay_ticks,
@@ -304,6 +325,7 @@ impl<R: Rig> Scoring<R> {
                 certificate: None,
                 received: Vec::new(),
                 statuses: BTreeMap::new(),
+                responses: Vec::new(),
                 recoveries_s: BTreeMap::new(),
             },
         }
@@ -329,6 +351,9 @@ impl<R: Rig> Scoring<R> {
         }
         *(if complete { &mut self.score.scored_ticks } else { &mut self.score.unscored_ticks }) += 1;
         self.rig.score(truth, fleet, estimate, &mut self.values);
+        if self.responses.are_observed() {
+            self.responses.take(|body, field, element| number(truth(body)?, field, element));
+        }
         self.score.faulted_ticks += u64::from(self.values.contains(&f64::INFINITY));
         let time_s = tick as f64 * self.tick_s;
         for (index, metric) in self.score.metrics.iter_mut().enumerate() {
@@ -366,9 +391,30 @@ impl<R: Rig> Scoring<R> {
     #[cold]
     fn apply_inputs(&mut self, tick: u64) {
         let rig = &mut self.rig;
-        self.inputs.advance(tick, |new| rig.set_input(new.by.port, new.values));
+        self.inputs.advance(tick, |new| {
+            if new.by.user == InputUser::Score {
+                rig.set_input(new.by.port, new.values);
+            }
+        });
         // V jumps with a set point.
         self.driven.iter_mut().for_each(|driven| driven.before = None);
+        let changes = self.changes.at(tick);
+        if changes.is_empty() {
+            return;
+        }
+        self.responses.end();
+        let before = self.changes.values_at(&self.infos, tick.saturating_sub(1));
+        let now = self.changes.values_at(&self.infos, tick);
+        for change in changes.iter().filter(|change| matches!(change.shape, Shape::Step | Shape::Pulse { .. })) {
+            let Some(info) = self.infos.get(change.input) else { continue };
+            let set_point = self.infos.iter().position(|other| {
+                let place = |field: &ResponseField| (field.body, field.field);
+                let same = other.response.as_ref().map(place) == info.response.as_ref().map(place);
+                same && other.response.is_some_and(|field| !field.disturbs)
+            });
+            let set_point = set_point.map_or(&[][..], |number| &now[number]);
+            self.responses.begin(info, tick, (&before[change.input], &now[change.input]), set_point);
+        }
     }
 
     /// Returns true if every metric with a limit is known and within it.
@@ -390,6 +436,7 @@ impl<R: Rig> Scoring<R> {
     pub fn finish(&mut self, received: impl Iterator<Item = u64>) -> Score {
         let services = self.services.iter().cloned();
         self.score.received = services.zip(received).collect();
+        self.score.responses = self.responses.finish();
         self.score.recoveries_s = self.recoveries_s();
         if let Some(certificate) = &mut self.score.certificate {
             let steps = self.next_tick * self.driven.len() as u64;

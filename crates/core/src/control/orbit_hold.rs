@@ -58,6 +58,11 @@ impl OrbitHold {
         Self { field, gains, thrust_max, lead_s }
     }
 
+    /// Returns the gains, to change them.
+    pub fn gains_mut(&mut self) -> &mut OrbitGains {
+        &mut self.gains
+    }
+
     /// Computes the thrust, du/s², that steers `body` to the circular orbit of radius `target` (du).
     ///
     /// `applied` is the thrust that acts on the body now; only the prediction uses it.

@@ -30,6 +30,25 @@ pub struct InputInfo {
     pub range: (f64, f64),
     /// The users of the input.
     pub uses: Vec<InputUse>,
+    /// The quantity that shows the response to a step; `None` if no response is measured.
+    pub response: Option<ResponseField>,
+}
+
+/// The quantity that shows the response to a step of an input.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ResponseField {
+    /// The body.
+    pub body: usize,
+    /// The field of its truth.
+    pub field: &'static str,
+    /// The element of the field; `None`: that of the input's component.
+    pub element: Option<usize>,
+    /// True if the distance from body 0 counts.
+    pub relative: bool,
+    /// The field of the truth with the command that acts, if it has one.
+    pub command: Option<&'static str>,
+    /// True if the input disturbs the quantity, false if it is the set point of the quantity.
+    pub disturbs: bool,
 }
 
 /// The kind of an input, in the words of the Functional Mock-up Interface (FMI 3.0, section 2.2.7).
@@ -146,25 +165,9 @@ impl Inputs {
         *self.received.lock().expect("no thread panics while it holds the lock") = Arc::new(list);
     }
 
-    /// Returns all changes that act up to a tick: the scripted ones of a tick first.
-    pub fn changes(&self, received: &ReceivedChanges) -> Vec<Change> {
-        let received = (0..received.count()).filter_map(|number| received.get(number));
-        let mut all: Vec<Change> = self.scripted.iter().copied().chain(received).collect();
-        // Stable: changes of one tick keep their order.
-        all.sort_by_key(|change| change.tick);
-        all
-    }
-
-    /// Returns the values of all inputs at a tick.
-    pub fn values_at(&self, received: &ReceivedChanges, tick: u64) -> Vec<Values> {
-        let mut courses: Vec<Course> =
-            self.infos.iter().map(|info| Course::new(InputInfo::values(&info.initial))).collect();
-        for change in self.changes(received).iter().filter(|change| change.tick <= tick) {
-            if let Some(course) = courses.get_mut(change.input) {
-                course.enter(change);
-            }
-        }
-        courses.iter().map(|course| course.at(tick)).collect()
+    /// Returns the changes of the scenario and those of the present run.
+    pub fn lists(&self) -> ChangeLists {
+        ChangeLists { scripted: Arc::clone(&self.scripted), received: self.received() }
     }
 
     /// Returns true if the key is that of a parameter of the loop, not of a signal from outside.
@@ -178,6 +181,42 @@ impl Inputs {
     /// The reason, with similar keys.
     pub fn find(&self, key: &str) -> Result<(usize, &InputInfo), String> {
         find(&self.infos, key)
+    }
+}
+
+/// The changes of a scenario, and those that its present run has received.
+#[derive(Debug)]
+pub struct ChangeLists {
+    scripted: Arc<[Change]>,
+    received: Arc<ReceivedChanges>,
+}
+
+impl ChangeLists {
+    /// Returns all changes with their origin, true for a received one, in the order of their ticks: of one tick the scripted ones
+    /// first.
+    pub fn all(&self) -> Vec<(Change, bool)> {
+        let received = (0..self.received.count()).filter_map(|number| self.received.get(number));
+        let scripted = self.scripted.iter().map(|change| (*change, false));
+        let mut all: Vec<(Change, bool)> = scripted.chain(received.map(|change| (change, true))).collect();
+        // Stable: changes of one tick keep their order.
+        all.sort_by_key(|(change, _)| change.tick);
+        all
+    }
+
+    /// Returns the changes that act from a tick on.
+    pub fn at(&self, tick: u64) -> Vec<Change> {
+        self.all().into_iter().map(|(change, _)| change).filter(|change| change.tick == tick).collect()
+    }
+
+    /// Returns the values of the inputs at a tick.
+    pub fn values_at(&self, infos: &[InputInfo], tick: u64) -> Vec<Values> {
+        let mut courses: Vec<Course> = infos.iter().map(|info| Course::new(InputInfo::values(&info.initial))).collect();
+        for (change, _) in self.all().iter().filter(|(change, _)| change.tick <= tick) {
+            if let Some(course) = courses.get_mut(change.input) {
+                course.enter(change);
+            }
+        }
+        courses.iter().map(|course| course.at(tick)).collect()
     }
 }
 

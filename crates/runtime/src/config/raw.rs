@@ -287,6 +287,16 @@ pub(crate) struct Accept {
     pub lateness_p99_us_max: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lateness_max_us: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rise_time_s_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub overshoot_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub settling_time_s_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub steady_state_error_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub command_peak_max: Option<f64>,
 }
 
 impl Accept {
@@ -299,6 +309,20 @@ impl Accept {
             ("age_max_us", self.age_max_us),
             ("lateness_p99_us_max", self.lateness_p99_us_max),
             ("lateness_max_us", self.lateness_max_us),
+        ];
+        limits.into_iter().filter_map(|(key, limit)| Some((key, limit?)))
+    }
+}
+
+impl Accept {
+    /// Returns the keys and limits of responses to steps of inputs.
+    pub fn responses(&self) -> impl Iterator<Item = (&'static str, f64)> {
+        let limits = [
+            ("rise_time_s_max", self.rise_time_s_max),
+            ("overshoot_max", self.overshoot_max),
+            ("settling_time_s_max", self.settling_time_s_max),
+            ("steady_state_error_max", self.steady_state_error_max),
+            ("command_peak_max", self.command_peak_max),
         ];
         limits.into_iter().filter_map(|(key, limit)| Some((key, limit?)))
     }

@@ -5,6 +5,7 @@
 //! and vectors, `resolve` reads a scenario; the mathematics is in `model`, `observe` and `control`.
 
 mod design;
+mod inputs;
 mod limits;
 mod resolve;
 mod roles;
@@ -18,7 +19,7 @@ use super::{
     BodyInfo, CertificateReport, ConditionReport, Context, Figure, FleetTruth, Graph, Monitor, NoFleet, Picture, Plane,
     Rig, Start, Watched,
 };
-use crate::config::{Checks, ConfigError, Document};
+use crate::config::{Checks, ConfigError, Document, InputInfo};
 use crate::control::{Condition, OrbitCertificate, OrbitHold};
 use crate::model::{Noise, OrbitFault, OrbitState};
 use crate::observe::OrbitVelocity;
@@ -198,7 +199,9 @@ impl Rig for OrbitRig {
     /// A follower measures its own velocity; the observed body does so only with full-state feedback.
     fn body(&self, index: usize) -> OrbitPlant {
         let velocity_measured = index != 0 || matches!(self.aim, Aim::Circle { full_state: true, .. });
-        OrbitPlant::new(self.field, self.initial[index], velocity_measured, self.sensors[index].noise.clone())
+        let noise = self.sensors[index].noise.clone();
+        let plant = OrbitPlant::new(self.field, self.initial[index], velocity_measured, noise);
+        plant.disturbed(&self.disturbances_du_s2[index])
     }
 
     fn estimator(&self) -> OrbitObserver {
@@ -227,6 +230,14 @@ impl Rig for OrbitRig {
 
     fn limits(&self) -> Vec<Figure> {
         self.limits.figures()
+    }
+
+    fn inputs(&self) -> Vec<InputInfo> {
+        inputs::inputs(self)
+    }
+
+    fn set_input(&mut self, port: usize, values: &[f64]) {
+        inputs::set(self, port, values);
     }
 
     fn monitors() -> &'static [Monitor<Self>] {
@@ -302,6 +313,7 @@ impl Rig for OrbitRig {
             bodies: pair(&self.bodies, index),
             initial: pair(&self.initial, index),
             sensors: pair(&self.sensors, index),
+            disturbances_du_s2: vec![Vector2::zeros(); 2],
             ..self.clone()
         };
         if !noisy {

@@ -249,6 +249,7 @@ fn safe_switch(raw: &Raw, bodies: &[BodyInfo]) -> Option<InputInfo> {
         initial: vec![f64::from(u8::from(raw.actuator.safe))],
         range: (0.0, 1.0),
         uses,
+        response: None,
     })
 }
 

@@ -20,6 +20,8 @@ pub struct OrbitRig {
     /// `None` if no body is driven.
     pub(super) controller: Option<ControllerDesign>,
     pub(super) aim: Aim,
+    /// Per body: the disturbance that acts on it, radial and transverse, du/s².
+    pub(super) disturbances_du_s2: Vec<Vector2<f64>>,
     pub(super) limits: Limits,
     pub(super) tick_s: f64,
 }

@@ -58,6 +58,12 @@ struct RawBody {
     noise: RawSensor,
     #[serde(default)]
     bias: RawSensor,
+    #[serde(default, skip_serializing_if = "is_zero")]
+    disturbance_du_s2: [f64; 2],
+}
+
+fn is_zero(vector: &[f64; 2]) -> bool {
+    *vector == [0.0; 2]
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -72,6 +78,8 @@ struct RawFollower {
     noise: RawSensor,
     #[serde(default)]
     bias: RawSensor,
+    #[serde(default, skip_serializing_if = "is_zero")]
+    disturbance_du_s2: [f64; 2],
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -252,6 +260,11 @@ impl Parts<'_> {
                 .controller
                 .map(|(gain, thrust_max, predict)| gain.controller(field, thrust_max, predict, context)),
             aim: self.aim,
+            disturbances_du_s2: [self.observed.disturbance_du_s2]
+                .into_iter()
+                .chain(self.followers.iter().map(|follower| follower.disturbance_du_s2))
+                .map(Vector2::from)
+                .collect(),
             tick_s: context.tick_s,
         };
         if sound {

@@ -17,6 +17,22 @@ pub(super) const POSITION: u64 = 0b0011;
 /// The bits of Vr and Vθ.
 pub(super) const VELOCITY: u64 = 0b1100;
 
+/// The numbers of the inputs that bodies, observers and laws of these rigs take.
+pub(super) mod port {
+    /// k_r, 1/s².
+    pub const RADIUS_GAIN: usize = 0;
+    /// k_v, 1/s.
+    pub const RADIAL_GAIN: usize = 1;
+    /// k_θ, 1/s.
+    pub const TRANSVERSE_GAIN: usize = 2;
+    /// The radius of the orbit to hold, du.
+    pub const TARGET: usize = 3;
+    /// The decay rates of the observer's errors, 1/s.
+    pub const DECAY: usize = 4;
+    /// The disturbance of a body, du/s².
+    pub const DISTURBANCE: usize = 5;
+}
+
 /// A body in a central field, with its sensors and thrusters.
 #[derive(Debug)]
 pub struct OrbitPlant {
@@ -29,13 +45,21 @@ pub struct OrbitPlant {
     measured: u64,
     /// [`status::FAULT`] once the body's motion has ended in the model, or 0.
     fault: u64,
+    /// The disturbance with the opposite sign, du/s²: subtracting zero leaves every bit of a number as it is.
+    resistance: Vector2<f64>,
 }
 
 impl OrbitPlant {
     /// Creates a body whose sensors measure its position, and its velocity if `velocity_measured`.
     pub(super) fn new(field: CentralField, state: OrbitState, velocity_measured: bool, noise: Noise<4>) -> Self {
         let measured = if velocity_measured { POSITION | VELOCITY } else { POSITION };
-        Self { field, state, applied: Vector2::zeros(), noise, measured, fault: 0 }
+        Self { field, state, applied: Vector2::zeros(), noise, measured, fault: 0, resistance: Vector2::zeros() }
+    }
+
+    /// Lets a disturbance act on the body, du/s².
+    #[must_use]
+    pub(super) fn disturbed(self, disturbance: &Vector2<f64>) -> Self {
+        Self { resistance: disturbance.map(|component| 0.0 - component), ..self }
     }
 }
 
@@ -86,9 +110,15 @@ impl Body for OrbitPlant {
         if self.fault != 0 {
             return;
         }
-        match self.field.flow(&self.state, &self.applied, dt_s) {
+        match self.field.flow(&self.state, &(self.applied - self.resistance), dt_s) {
             Ok(state) => self.state = state,
             Err(fault) => (self.state, self.fault) = (fault.last(), status::FAULT),
+        }
+    }
+
+    fn set_input(&mut self, port: usize, values: &[f64]) {
+        if let (port::DISTURBANCE, &[radial, transverse]) = (port, values) {
+            self.resistance = Vector2::new(0.0 - radial, 0.0 - transverse);
         }
     }
 }
@@ -176,6 +206,13 @@ impl Estimator for OrbitObserver {
         if let Some(OrbitSample { thrust, .. }) = &self.last {
             let from = self.estimate();
             self.coasted = Some(self.field.flow(&from, thrust, dt_s).unwrap_or(from));
+        }
+    }
+
+    fn set_input(&mut self, port: usize, values: &[f64]) {
+        if let (port::DECAY, &[first, second]) = (port, values) {
+            self.design = FilterDesign::First([first, second]);
+            self.filter = self.design.filter(*self.filter.estimate());
         }
     }
 
@@ -276,6 +313,22 @@ impl Law for OrbitLaw {
         out.thrust_du_s2 = self.thrust(estimate, measurement).unwrap_or_default().into();
         if let Some(sent) = self.in_flight.sent(measurement.stamp.tick) {
             *sent = out.thrust_du_s2;
+        }
+    }
+
+    fn set_input(&mut self, port: usize, values: &[f64]) {
+        let &[value] = values else { return };
+        let gains = self.law.gains_mut();
+        match port {
+            port::RADIUS_GAIN => gains.radius_per_s2 = value,
+            port::RADIAL_GAIN => gains.radial_per_s = value,
+            port::TRANSVERSE_GAIN => gains.transverse_per_s = value,
+            port::TARGET => {
+                if let Aim::Circle { radius, .. } = &mut self.aim {
+                    *radius = value;
+                }
+            }
+            _ => {}
         }
     }
 }

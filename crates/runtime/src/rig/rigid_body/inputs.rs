@@ -2,7 +2,7 @@
 
 use super::RigidBodyRig;
 use super::design::ObserverDesign;
-use crate::config::{InputInfo, InputUse, InputUser, Variability};
+use crate::config::{InputInfo, InputUse, InputUser, ResponseField, Variability};
 use crate::rate::port;
 use crate::rig::filter::FilterDesign;
 use nalgebra::Vector3;
@@ -26,6 +26,7 @@ pub(super) fn inputs(rig: &RigidBodyRig) -> Vec<InputInfo> {
             initial: controller.gain_per_s.as_slice().to_vec(),
             range: (0.0, f64::INFINITY),
             uses: laws(port::GAIN).chain([score(0, port::GAIN)]).collect(),
+            response: None,
         });
     }
     if let ObserverDesign::Hidden { filter: FilterDesign::First([rate]), .. } = &rig.observer {
@@ -37,6 +38,7 @@ pub(super) fn inputs(rig: &RigidBodyRig) -> Vec<InputInfo> {
             initial: vec![*rate],
             range: (0.0, f64::INFINITY),
             uses: std::iter::once(observer).chain(laws(port::DECAY)).chain([score(0, port::DECAY)]).collect(),
+            response: None,
         });
     }
     for index in 0..rig.bodies.len() {
@@ -51,6 +53,7 @@ pub(super) fn inputs(rig: &RigidBodyRig) -> Vec<InputInfo> {
                 initial: rig.offsets_rad_s[index].as_slice().to_vec(),
                 range: (-largest, largest),
                 uses: vec![law, score(index, port::OFFSET)],
+                response: response(rig, index, false),
             });
         }
         let played = index == 0 && rig.playback.is_some();
@@ -64,10 +67,18 @@ pub(super) fn inputs(rig: &RigidBodyRig) -> Vec<InputInfo> {
                 initial: rig.disturbances_rad_s2[index].as_slice().to_vec(),
                 range: (-largest, largest),
                 uses: vec![plant, score(index, port::DISTURBANCE)],
+                response: response(rig, index, true),
             });
         }
     }
     inputs
+}
+
+/// Returns the response of a driven single body: its rate relative to the leader.
+fn response(rig: &RigidBodyRig, index: usize, disturbs: bool) -> Option<ResponseField> {
+    let (field, command) = ("omega_rad_s", Some("applied_rad_s2"));
+    let single = rig.bodies[index].driven && rig.bodies[index].fleet.is_none();
+    single.then_some(ResponseField { body: index, field, element: None, relative: true, command, disturbs })
 }
 
 /// Takes new values for the score.
