@@ -1,14 +1,16 @@
 //! `corotate set` and `corotate get`: change inputs of a running loop, and print their values.
 
-use super::output::{CommandResult, Exit, Failure, fail, harmless, say};
+use super::output::{CommandResult, Exit, Failure, fail, harmless, remark, say};
 use super::runs;
 use crate::config::{Document, Variability};
 use crate::inputs::{Answer, InputError, Request, Tuned, WantedChange, current, request};
 use crate::scenario::Scenario;
-use crate::seat::scenario_of;
+use crate::seat::{scenario_of, write_whole};
+use std::collections::BTreeMap;
 use std::fmt::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use toml::Value;
+use toml_edit::{DocumentMut, Item};
 
 /// Options of `corotate set`.
 #[derive(clap::Args)]
@@ -16,7 +18,7 @@ use toml::Value;
 pub struct SetArguments {
     /// The run (its directory or domain; default: the newest), then the
     /// inputs to change, all at the same tick
-    #[arg(required = true, value_name = "[RUN] KEY=VALUE")]
+    #[arg(required_unless_present = "save", value_name = "[RUN] KEY=VALUE")]
     words: Vec<String>,
     /// The tick from which the changes act [default: the earliest]
     #[arg(long, value_name = "TICK")]
@@ -24,6 +26,10 @@ pub struct SetArguments {
     /// Change the values linearly over this time, s
     #[arg(long, value_name = "SECONDS", default_value = "0", value_parser = seconds)]
     ramp: f64,
+    /// Write the values that differ from this scenario's to its file, and keep
+    /// its comments and order
+    #[arg(long, value_name = "FILE")]
+    save: Option<PathBuf>,
     /// Set values with which the loop does not converge
     #[arg(long)]
     force: bool,
@@ -53,7 +59,8 @@ recording, and is replayed with it.
 Examples:
   corotate set controller.gain_per_s=[6,6,6]
   corotate set follower.0.offset_rad_s=[0,0,0.2] --ramp 2
-  corotate set runs/pair actuator.safe=true --at 5000";
+  corotate set runs/pair actuator.safe=true --at 5000
+  corotate set --save pair.toml    keep what was found";
 
 const GET_EXAMPLES: &str = "\
 Examples:
@@ -73,7 +80,11 @@ pub fn set(arguments: &SetArguments) -> CommandResult {
     let root = runs::domain(run.map(Path::new))?;
     let changes = assignments.iter().map(|word| wanted(word, arguments.ramp)).collect::<Result<Vec<_>, _>>();
     let changes = changes.map_err(|failure| fail(Exit::Usage, failure))?;
+    if changes.is_empty() {
+        return save(&root, arguments);
+    }
     let answer = change(&root, changes.clone(), arguments).map_err(|error| fail(exit_of(&error), failure(&error)))?;
+    save(&root, arguments)?;
     if arguments.json {
         return say(&format!("{}\n", serde_json::to_string(&answer).expect("plain values are JSON")));
     }
@@ -86,6 +97,80 @@ pub fn set(arguments: &SetArguments) -> CommandResult {
         writeln!(text, "{key} = {value} from tick {tick} ({time_s:.3} s){delay}").expect("writing to a string works");
     }
     say(&harmless(&text))
+}
+
+/// Writes the present values of a run to the scenario file of `--save`, where they differ.
+fn save(root: &Path, arguments: &SetArguments) -> CommandResult {
+    let Some(path) = &arguments.save else { return Ok(Exit::Ok) };
+    let (_, values) = current(root).map_err(|error| fail(exit_of(&error), failure(&error)))?;
+    match saved(path, &values) {
+        Ok(keys) => {
+            let names = if keys.is_empty() { "nothing differs".to_owned() } else { keys.join(", ") };
+            remark(&format!("{}: {names}", path.display()));
+            Ok(Exit::Ok)
+        }
+        Err(failure) => Err(fail(Exit::Usage, failure)),
+    }
+}
+
+/// Changes the values in a scenario file that differ from the given ones, and returns their keys.
+fn saved(path: &Path, values: &BTreeMap<String, Value>) -> Result<Vec<String>, Failure> {
+    let refuse = |error: &dyn std::fmt::Display| {
+        Failure::new("cannot-write", format!("{}: {error}; name a scenario file that can be written", path.display()))
+    };
+    let text = std::fs::read_to_string(path).map_err(|error| refuse(&error))?;
+    let scenario = Scenario::load(path, &[])?;
+    let mut document: DocumentMut = text.parse().map_err(|error| refuse(&error))?;
+    let differs = |(key, value): &(&String, &Value)| {
+        scenario.inputs.find(key).is_ok_and(|(_, info)| info.to_toml(&info.initial) != **value)
+    };
+    let keys: Vec<String> = values.iter().filter(differs).map(|(key, _)| key.clone()).collect();
+    for key in &keys {
+        put(document.as_item_mut(), &key.split('.').collect::<Vec<_>>(), &values[key]);
+    }
+    let text = document.to_string();
+    let written = Scenario::parse(&text, &path.display().to_string(), &[])?;
+    let missing = keys
+        .iter()
+        .find(|key| written.inputs.find(key).map_or(true, |(_, info)| info.to_toml(&info.initial) != values[*key]));
+    if let Some(key) = missing {
+        return Err(Failure::new(
+            "no-value",
+            format!("{}: {key} has no place there; add the key first", path.display()),
+        ));
+    }
+    if !keys.is_empty() {
+        write_whole(path, text.as_bytes()).map_err(|error| refuse(&error))?;
+    }
+    Ok(keys)
+}
+
+/// Puts a value at a path; a comment on its line stays.
+fn put(item: &mut Item, steps: &[&str], value: &Value) {
+    let Some((first, rest)) = steps.split_first() else {
+        let decor = item.as_value().map(|old| old.decor().clone());
+        let mut new = edited(value);
+        decor.into_iter().for_each(|decor| *new.decor_mut() = decor);
+        *item = Item::Value(new);
+        return;
+    };
+    let inner = match first.parse::<usize>() {
+        Ok(index) => item.get_mut(index),
+        Err(_) => item.as_table_like_mut().map(|table| {
+            let empty = if rest.is_empty() { Item::None } else { Item::Table(toml_edit::Table::new()) };
+            table.entry(first).or_insert(empty)
+        }),
+    };
+    inner.into_iter().for_each(|inner| put(inner, rest, value));
+}
+
+/// Returns a value of an input as text would have it.
+fn edited(value: &Value) -> toml_edit::Value {
+    match value {
+        Value::Boolean(on) => (*on).into(),
+        Value::Array(list) => list.iter().filter_map(Value::as_float).collect(),
+        value => value.as_float().unwrap_or_default().into(),
+    }
 }
 
 /// Checks the changes against the run's scenario and its present values, then asks for them.
@@ -155,12 +240,12 @@ fn split(words: &[String], is_rest: impl Fn(&str) -> bool) -> (Option<&str>, &[S
 
 /// Reads an assignment such as `controller.gain_per_s=[6,6,6]`.
 fn wanted(word: &str, ramp_s: f64) -> Result<WantedChange, Failure> {
-    let mut document = Document::parse("", "set").map_err(Failure::from)?;
-    let (key, text) = word.split_once('=').unwrap_or((word, ""));
-    let refuse = |_| Failure::new("no-value", format!("{word}: the value is neither TOML nor a word; write key=value"));
-    document.set(&format!("value={text}")).map_err(refuse)?;
-    let value = document.get("value").cloned().unwrap_or(Value::Boolean(false));
-    Ok(WantedChange { key: key.trim().replace('[', ".").replace(']', ""), value, ramp_s })
+    let mut document = Document::parse("", "set")?;
+    let key = word.split('=').next().unwrap_or_default().trim().replace('[', ".").replace(']', "");
+    document.set(word)?;
+    let value = document.get(&key).cloned();
+    let value = value.ok_or_else(|| Failure::new("no-value", format!("{word}: there is no value; write key=value")))?;
+    Ok(WantedChange { key, value, ramp_s })
 }
 
 fn failure(error: &InputError) -> Failure {

@@ -16,6 +16,9 @@ pub struct Arguments {
     /// The run's results directory or domain [default: your newest run]
     #[arg(value_name = "DIR")]
     domain: Option<PathBuf>,
+    /// Show the inputs in the place of the signals, to change them
+    #[arg(long, conflicts_with = "once")]
+    tune: bool,
     /// Watch for S seconds (2 if left out), print one screen of 80 by 24, exit
     #[arg(long, value_name = "S", num_args = 0..=1, default_missing_value = "2", value_parser = seconds)]
     once: Option<f64>,
@@ -34,7 +37,8 @@ fn seconds(text: &str) -> Result<f64, String> {
 
 const EXAMPLES: &str = "\
 Keys: q: quit; space: pause; up, down, tab: select a signal; left, right:
-scroll its fields. Latencies are median/99 % of the last 4096 samples, from the
+scroll its fields; t: the inputs, which change by a typed number and Enter, or
+by left and right; u: undo. Latencies are median/99 % of the last 4096 samples, from the
 samples' stamps: due-sent from the tick's due time to the sending of the role's
 sample, in-sent from the sending of the input to that of the role's sample.
 In real time a line has the number of late ticks, and the last one's cause.
@@ -42,6 +46,7 @@ In real time a line has the number of late ticks, and the last one's cause.
 Examples:
   corotate run & corotate watch    your newest run
   corotate watch runs/pair         the run started by `run --out runs/pair`
+  corotate watch --tune            change gains and set points
   corotate watch --once 5 > screen.txt
                                    one screen as text, after five seconds";
 
@@ -59,7 +64,7 @@ fn attempt(arguments: &Arguments, domain: &Path, signal: &AtomicUsize) -> Result
         opened => opened?,
     };
     match arguments.once {
-        None => show(&mut session, signal)?,
+        None => show(&mut session, arguments.tune, signal)?,
         Some(seconds) => {
             session.follow((seconds * 1e9) as u64, || received() != 0)?;
             if let Err(exit) = say(&if arguments.json { json(&session.model) } else { text(&session.model, 80, 24) }) {

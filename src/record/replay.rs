@@ -161,8 +161,9 @@ impl<'a> Comparer<'a> {
         if !self.is_compared(&stamp) {
             return;
         }
-        let (track, index) = (&self.tracks[output], self.next[output]);
-        self.next[output] += 1;
+        let track = &self.tracks[output];
+        let index = (self.next[output]..).find(|index| !is_sent_again(track, *index)).unwrap_or(track.len());
+        self.next[output] = index + 1;
         if self.difference.as_ref().is_some_and(|first| first.tick <= stamp.tick) {
             return;
         }
@@ -205,7 +206,8 @@ impl<'a> Comparer<'a> {
         // After the last step nothing is sent, not even late samples.
         let sent_before = end.min(steps.last().map_or(0, |step| step.tick + 1));
         for (output, track) in self.tracks.iter().enumerate() {
-            if let Some(index) = (self.next[output]..track.len()).find(|index| self.is_compared(&track.stamp(*index))) {
+            let is_compared = |index: &usize| self.is_compared(&track.stamp(*index)) && !is_sent_again(track, *index);
+            if let Some(index) = (self.next[output]..track.len()).find(is_compared) {
                 let tick = track.stamp(index).tick;
                 // An injected delay may have moved the sample past the end.
                 if tick.saturating_add(script.late_ticks) < sent_before {
@@ -222,6 +224,14 @@ impl<'a> Comparer<'a> {
             limit,
         }
     }
+}
+
+/// Returns true if a successor sent a recorded sample again, because its predecessor was killed after it had sent the sample and
+/// before it had noted that. In a replay no role is killed there.
+fn is_sent_again(track: &Track, index: usize) -> bool {
+    let Some(before) = index.checked_sub(1).filter(|_| index < track.len()) else { return false };
+    let (before, again) = (track.stamp(before), track.stamp(index));
+    again.tick == before.tick && again.generation & !NO_SAMPLE > before.generation & !NO_SAMPLE
 }
 
 /// Formats a value; a floating-point number with its bits.

@@ -11,6 +11,8 @@ pub enum Action {
     Pause,
     /// Move the selection of the signal down by the given number.
     Select(isize),
+    /// Show the inputs in the place of the signals, or the signals again.
+    Tune,
     /// Scroll the fields of the selected signal down by the given number.
     Scroll(isize),
 }
@@ -25,6 +27,7 @@ pub fn action(key: KeyEvent) -> Option<Action> {
         KeyCode::Char('c') if key.modifiers.contains(KeyModifiers::CONTROL) => Some(Action::Quit),
         KeyCode::Char('q') | KeyCode::Esc => Some(Action::Quit),
         KeyCode::Char(' ') => Some(Action::Pause),
+        KeyCode::Char('t') => Some(Action::Tune),
         KeyCode::Down | KeyCode::Tab | KeyCode::Char('j') => Some(Action::Select(1)),
         KeyCode::Up | KeyCode::BackTab | KeyCode::Char('k') => Some(Action::Select(-1)),
         KeyCode::Right | KeyCode::PageDown => Some(Action::Scroll(1)),
@@ -42,6 +45,7 @@ mod tests {
         let press = |code| action(KeyEvent::new(code, KeyModifiers::NONE));
         assert_eq!(press(KeyCode::Char('q')), Some(Action::Quit));
         assert_eq!(press(KeyCode::Char(' ')), Some(Action::Pause));
+        assert_eq!(press(KeyCode::Char('t')), Some(Action::Tune));
         assert_eq!((press(KeyCode::Tab), press(KeyCode::Up)), (Some(Action::Select(1)), Some(Action::Select(-1))));
         assert_eq!((press(KeyCode::Char('c')), press(KeyCode::Char('x'))), (None, None));
         let interrupt = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);

@@ -7,9 +7,10 @@
 //! | `session` | finds a run, joins it, detects its end |
 //! | `screen` | draws the model |
 //! | `input` | maps keys to actions |
+//! | `tune` | shows and changes inputs |
 //! | `terminal` | sets up the terminal, and restores it however the program ends |
 //!
-//! Must not delay a role, create a signal, or publish anything.
+//! Must not delay a role, create a signal, or publish a sample.
 
 mod feed;
 mod input;
@@ -17,12 +18,14 @@ mod model;
 mod screen;
 mod session;
 mod terminal;
+mod tune;
 
 pub use input::{Action, action};
 pub use model::{Event, History, Model, RoleLine, Series, SignalLine, Window};
 pub use screen::{draw, text};
 pub use session::Session;
 pub use terminal::show;
+pub use tune::TuneView;
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;

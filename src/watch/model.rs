@@ -2,6 +2,7 @@
 //!
 //! Must not lose a peak: an entry that stands for several values keeps the largest.
 
+use super::tune::TuneView;
 use crate::late::LateStatus;
 use crate::sample::RoleState;
 use crate::telemetry::{quantile, sorted};
@@ -51,6 +52,8 @@ pub struct Model {
     pub selected: usize,
     /// The index of the first visible field of the selected signal.
     pub scroll: usize,
+    /// The inputs, while they are shown in the place of the signals.
+    pub tune: Option<TuneView>,
 }
 
 /// The line of a role.

@@ -1,6 +1,7 @@
 //! Draws the model. 80 by 24 cells suffice; the screen states how many roles it omits.
 
 use super::model::{Model, RoleLine, Series};
+use super::tune::TuneView;
 use crate::late::{LastLate, LateKind, LateStatus};
 use crate::sample::RoleState;
 use ratatui::backend::TestBackend;
@@ -23,6 +24,8 @@ const FIELDS_MIN: u16 = 5;
 const NAME_WIDTH: u16 = 24;
 const SCALE_WIDTH: u16 = 6;
 const FIELD_WIDTH: usize = 26;
+/// The columns for the name of an input.
+const INPUT_WIDTH: usize = 36;
 /// The resolution of a sparkline, finer than any screen.
 const STEPS: f64 = 1000.0;
 
@@ -66,9 +69,19 @@ pub fn draw(model: &Model, frame: &mut Frame<'_>) {
     let series_area = section("errors, log scale, largest value per column", series_area, frame);
     draw_series(model, lines, frame, series_area);
     draw_events(model, frame, event_area);
-    let signal_area = section(&signal_title(model, usize::from(area.width)), signal_area, frame);
-    draw_signals(model, frame, signal_area);
-    frame.render_widget(Line::styled("q quit  space pause  up/down/tab signal  left/right fields", DIM), foot);
+    let keys = match &model.tune {
+        None => {
+            let signal_area = section(&signal_title(model, usize::from(area.width)), signal_area, frame);
+            draw_signals(model, frame, signal_area);
+            "q quit  space pause  up/down/tab signal  left/right fields  t tune"
+        }
+        Some(tune) => {
+            let signal_area = section("inputs", signal_area, frame);
+            draw_inputs(tune, frame, signal_area);
+            "q quit  up/down input  left/right change  number, Enter: set  u undo  t signals"
+        }
+    };
+    frame.render_widget(Line::styled(keys, DIM), foot);
 }
 
 /// Returns the screen as text, without colours.
@@ -228,6 +241,22 @@ fn signal_title(model: &Model, width: usize) -> String {
     let more = |hidden: bool| if hidden { "..." } else { "" };
     let title = format!("signals ({}): {}{shown}{}", names.len(), more(first > 0), more(end < names.len()));
     title.trim_end().to_owned()
+}
+
+/// Draws the inputs around the selected one, and the outcome of the last change.
+fn draw_inputs(tune: &TuneView, frame: &mut Frame<'_>, area: Rect) {
+    let room = usize::from(area.height).saturating_sub(1);
+    let first = (tune.selected + 1).saturating_sub(room);
+    let row = |(index, (label, value)): (usize, &(String, String))| {
+        let selected = index == tune.selected;
+        let typed = if selected && !tune.typed.is_empty() { format!("  > {}_", tune.typed) } else { String::new() };
+        let mark = if selected { '>' } else { ' ' };
+        let style = if selected { BOLD } else { Style::new() };
+        Line::styled(format!("{mark}{:<INPUT_WIDTH$} {value:>14}{typed}", cut(label, INPUT_WIDTH)), style)
+    };
+    let rows = tune.rows.iter().enumerate().skip(first).take(room).map(row);
+    let message = Line::styled(cut(tune.message.lines().next().unwrap_or_default(), usize::from(area.width)), DIM);
+    frame.render_widget(Paragraph::new(rows.chain([message]).collect::<Vec<_>>()), area);
 }
 
 /// Draws the fields of the selected signal, which the title names.

@@ -5,6 +5,7 @@
 use super::WatchError;
 use super::feed::{Feed, POLL_NS};
 use super::model::Model;
+use super::tune::Tune;
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
@@ -92,6 +93,11 @@ impl Session {
             self.leave();
         }
         Ok(())
+    }
+
+    /// Starts to tune the run; `None` if that is not possible.
+    pub(super) fn tune(&self) -> Option<Tune> {
+        Tune::start(self.domain.root())
     }
 
     /// Updates the parts of the model that only a screen needs.

@@ -8,9 +8,10 @@ use super::input::{Action, action};
 use super::model::Model;
 use super::screen::draw;
 use super::session::Session;
+use super::tune::Tune;
 use crate::clock::monotonic_ns;
 use ratatui::DefaultTerminal;
-use ratatui::crossterm::event::{self, Event};
+use ratatui::crossterm::event::{self, Event, KeyEventKind};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use std::io::{self, IsTerminal};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -19,22 +20,28 @@ use std::time::Duration;
 /// The time between two drawings, ns: a user can read them, and a slow line can carry them.
 const DRAW_NS: u64 = 200_000_000;
 
-/// Shows a run until the user quits or a signal arrives.
+/// Shows a run until the user quits or a signal arrives; with `tunes` its inputs in the place of its signals.
 ///
 /// # Errors
 /// [`WatchError`].
-pub fn show(session: &mut Session, signal: &AtomicUsize) -> Result<(), WatchError> {
+pub fn show(session: &mut Session, tunes: bool, signal: &AtomicUsize) -> Result<(), WatchError> {
     let failed = |source| WatchError::Terminal { source };
     if !io::stdout().is_terminal() || !io::stdin().is_terminal() {
         return Err(failed(io::Error::other("stdin and stdout are not a terminal")));
     }
     let mut terminal = ratatui::try_init().map_err(failed)?;
-    let shown = watch(&mut terminal, session, signal);
+    let tune = if tunes { session.tune() } else { None };
+    let shown = watch(&mut terminal, session, tune, signal);
     ratatui::restore();
     shown
 }
 
-fn watch(terminal: &mut DefaultTerminal, session: &mut Session, signal: &AtomicUsize) -> Result<(), WatchError> {
+fn watch(
+    terminal: &mut DefaultTerminal,
+    session: &mut Session,
+    mut tune: Option<Tune>,
+    signal: &AtomicUsize,
+) -> Result<(), WatchError> {
     let failed = |source| WatchError::Terminal { source };
     let (mut paused, mut next_draw_ns): (Option<Model>, u64) = (None, 0);
     while signal.load(Ordering::Relaxed) == 0 {
@@ -43,6 +50,7 @@ fn watch(terminal: &mut DefaultTerminal, session: &mut Session, signal: &AtomicU
         let now_ns = monotonic_ns();
         if now_ns >= next_draw_ns {
             session.refresh();
+            session.model.tune = tune.as_mut().map(Tune::view);
             let model = paused.as_ref().unwrap_or(&session.model);
             terminal.draw(|frame| draw(model, frame)).map_err(failed)?;
             next_draw_ns = now_ns + DRAW_NS;
@@ -54,6 +62,9 @@ fn watch(terminal: &mut DefaultTerminal, session: &mut Session, signal: &AtomicU
             continue;
         }
         let wanted = match event::read().map_err(failed)? {
+            Event::Key(key) if key.kind != KeyEventKind::Release && tune.as_mut().is_some_and(|tune| tune.key(key)) => {
+                None
+            }
             Event::Key(key) => action(key),
             _ => None,
         };
@@ -63,6 +74,7 @@ fn watch(terminal: &mut DefaultTerminal, session: &mut Session, signal: &AtomicU
                 let snapshot = Model { paused: true, ..session.model.clone() };
                 paused = if paused.is_some() { None } else { Some(snapshot) };
             }
+            Some(Action::Tune) => tune = if tune.is_some() { None } else { session.tune() },
             Some(Action::Select(by)) => apply(&mut paused, session, |model| model.select(by)),
             Some(Action::Scroll(by)) => apply(&mut paused, session, |model| model.scroll(by)),
             None => {}

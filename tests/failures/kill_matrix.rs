@@ -39,6 +39,26 @@ fn assert_survived(bench: &Bench, done: &Done, role: &str, case: &str) -> Value 
     summary
 }
 
+/// A sample that a killed role had sent and its successor sends again is one sample in a replay too.
+#[test]
+fn the_recording_of_a_run_with_a_killed_role_is_replayed() {
+    let bench = Bench::new();
+    for role in ROLES {
+        for place in RUNNING {
+            let done = start(
+                &bench,
+                role,
+                place,
+                "KILL",
+                &["--clock", "lockstep", "--record", "--duration", "2", "--set=accept={}"],
+            );
+            assert_eq!(done.wait().code, Some(0), "{role} {place}");
+            let replay = bench.run(&["replay", "out", "--json"]);
+            assert_eq!((replay.code, replay.roles_replayed()), (Some(0), (4, 4)), "{role} {place}: {replay:?}");
+        }
+    }
+}
+
 /// Lockstep waits for a dead role, and its successor has its committed state: not a bit is lost.
 #[test]
 fn in_lockstep_a_killed_role_costs_nothing() {

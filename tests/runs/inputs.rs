@@ -358,6 +358,37 @@ fn impossible_changes_are_refused_with_their_reason() {
     assert_eq!(none.code, Some(2), "{none:?}");
 }
 
+#[test]
+fn tuned_values_are_saved_in_the_scenario_file_with_its_comments() {
+    let bench = Bench::new();
+    let text = std::fs::read_to_string(crate::common::shipped("rigid-pair")).unwrap();
+    let file = bench.path("pair.toml");
+    std::fs::write(&file, format!("# first\n{text}\n# last\n")).unwrap();
+    let running = bench.start_endless(&[]);
+    let root = domain(&bench);
+    let before = await_inputs(&root);
+    assert!(before < 1_000_000_000);
+    let save = |words: &[&str]| bench.run(&[&["set", "out"], words, &["--save", "pair.toml"]].concat());
+    save(&[]).succeeded();
+    assert_eq!(std::fs::read_to_string(&file).unwrap(), format!("# first\n{text}\n# last\n"), "nothing differs");
+    let tick = ask(&root, "follower.0.offset_rad_s", vec![0.0, 0.25, 0.0], 0.0, None).unwrap();
+    await_some(|| (current(&root).unwrap().0 > tick).then_some(()));
+    let gains = bench.run(&["set", "out", "controller.gain_per_s=[7,6.5,5]", "--json"]).succeeded().json();
+    await_some(|| (current(&root).unwrap().0 > gains["tick"].as_u64().unwrap()).then_some(()));
+    save(&[]).succeeded();
+    let saved = std::fs::read_to_string(&file).unwrap();
+    let table: toml::Table = saved.parse().unwrap();
+    assert_eq!(table["controller"]["gain_per_s"], toml::Value::from(vec![7.0, 6.5, 5.0]));
+    assert_eq!(table["follower"][0]["offset_rad_s"], toml::Value::from(vec![0.0, 0.25, 0.0]));
+    let comments = |text: &str| text.lines().filter(|line| line.contains('#')).count();
+    assert_eq!(comments(&saved), comments(&text) + 2);
+    assert!(saved.starts_with("# first") && saved.trim_end().ends_with("# last"));
+    bench.run(&["check", "pair.toml"]).succeeded();
+    assert_eq!(bench.run(&["set", "out", "--save", "absent.toml"]).code, Some(2));
+    running.signal(15);
+    running.wait();
+}
+
 /// Two programs at once: each change is made, one after the other.
 #[test]
 fn two_programs_may_set_at_once_and_malformed_requests_harm_nothing() {

@@ -407,11 +407,12 @@ impl<R: Rig> Scoring<R> {
         let now = self.changes.values_at(&self.infos, tick);
         for change in changes.iter().filter(|change| matches!(change.shape, Shape::Step | Shape::Pulse { .. })) {
             let Some(info) = self.infos.get(change.input) else { continue };
-            let set_point = self.infos.iter().position(|other| {
-                let place = |field: &ResponseField| (field.body, field.field);
-                let same = other.response.as_ref().map(place) == info.response.as_ref().map(place);
-                same && other.response.is_some_and(|field| !field.disturbs)
-            });
+            let place = |field: ResponseField| (field.body, field.field);
+            let is_set_point = |known: &InputInfo| {
+                known.response.is_some_and(|field| !field.disturbs)
+                    && known.response.map(place) == info.response.map(place)
+            };
+            let set_point = self.infos.iter().position(is_set_point);
             let set_point = set_point.map_or(&[][..], |number| &now[number]);
             self.responses.begin(info, tick, (&before[change.input], &now[change.input]), set_point);
         }

@@ -86,9 +86,12 @@ pub(super) fn set(rig: &mut RigidBodyRig, score_port: usize, values: &[f64]) {
     let (index, port) = (score_port / port::COUNT, score_port % port::COUNT);
     match (port, values) {
         (port::GAIN, &[x, y, z]) => {
-            rig.certificate = rig.certificate.map(|of| of.with_rates(Some(Vector3::new(x, y, z)), None));
+            rig.certificate =
+                rig.certificate.map(|certificate| certificate.with_rates(Some(Vector3::new(x, y, z)), None));
         }
-        (port::DECAY, &[rate]) => rig.certificate = rig.certificate.map(|of| of.with_rates(None, Some(rate))),
+        (port::DECAY, &[rate]) => {
+            rig.certificate = rig.certificate.map(|certificate| certificate.with_rates(None, Some(rate)))
+        }
         (port::OFFSET, &[x, y, z]) => rig.offsets_rad_s[index] = Vector3::new(x, y, z),
         (port::DISTURBANCE, &[x, y, z]) => rig.disturbances_rad_s2[index] = Vector3::new(x, y, z),
         _ => {}
