@@ -9,7 +9,7 @@ use crate::scenario::Scenario;
 use crate::seat::scenario_of;
 use ratatui::crossterm::event::{KeyCode, KeyEvent};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 use toml::Value;
@@ -200,7 +200,7 @@ impl Row {
 }
 
 /// Reads the values at intervals, and asks for changes, until the other end is dropped or the run is over.
-fn talk(root: &PathBuf, scenario: &Scenario, wanted: &Receiver<WantedChange>, news: &Sender<News>) {
+fn talk(root: &Path, scenario: &Scenario, wanted: &Receiver<WantedChange>, news: &Sender<News>) {
     loop {
         let asked = match wanted.recv_timeout(READ) {
             Ok(change) => Some(change),

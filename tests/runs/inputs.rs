@@ -408,7 +408,7 @@ fn two_programs_may_set_at_once_and_malformed_requests_harm_nothing() {
         let _ = stream.read_to_string(&mut answer);
         assert!(answer.is_empty() || answer.contains("refused"), "{answer}");
     }
-    // A client that sends nothing holds up nobody else.
+    // A client that sends nothing holds up no other.
     let _silent = std::os::unix::net::UnixStream::connect(&socket).unwrap();
     let set = |key: &'static str| {
         let root = root.clone();

@@ -1,8 +1,9 @@
 //! Two DC motors: the follower tracks the leader's speed, although the leader's load torque is not measured.
 
+use corotate::config::{Checks, InputInfo, InputUser, Variability};
 use corotate::rig::{Context, Difference, SimpleRig};
 use corotate::role::{Body, InvariantRelation, Law, RelationObserver};
-use corotate::{Program, config::Checks, nalgebra::Vector1, observe::Increment, persist_fields, sample};
+use corotate::{Program, nalgebra::Vector1, observe::Increment, persist_fields, sample};
 use serde::{Deserialize, Serialize};
 use std::process::ExitCode;
 
@@ -57,6 +58,9 @@ impl Body for MotorBody {
         let rate = motor.friction_n_m_s / motor.inertia_kg_m2;
         state.speed_rad_s = end + (state.speed_rad_s - end) * (-rate * dt_s).exp();
     }
+    fn set_input(&mut self, _port: usize, values: &[f64]) {
+        self.state.load_n_m = values[0];
+    }
 }
 
 /// ∫τ dt = ∫(k i − b ω) dt − J Δω: the load is the unknown.
@@ -85,6 +89,9 @@ impl Law for Motor {
         let rise = leader.rise_rad_s2 - self.gain_per_s * (own.speed_rad_s - leader.speed_rad_s);
         out.current_a = (self.inertia_kg_m2 * rise + self.friction_n_m_s * own.speed_rad_s) / self.torque_n_m_per_a;
     }
+    fn set_input(&mut self, _port: usize, values: &[f64]) {
+        self.gain_per_s = values[0];
+    }
 }
 persist_fields!(Motor,);
 
@@ -112,6 +119,13 @@ impl SimpleRig for MotorPair {
     }
     fn law(&self, _index: usize) -> Motor {
         self.motor
+    }
+    fn inputs(&self) -> Vec<InputInfo> {
+        let Motor { gain_per_s, leader_load_n_m, .. } = self.motor;
+        let gain = InputInfo::new("motor.gain_per_s", Variability::Tunable, "gain of the law, 1/s", &[gain_per_s]);
+        let load =
+            InputInfo::new("motor.leader_load_n_m", Variability::Input, "the leader's load, N m", &[leader_load_n_m]);
+        vec![gain.within(0.0, 100.0).used_by([InputUser::Law(1)], 0), load.used_by([InputUser::Body(0)], 0)]
     }
 }
 

@@ -88,6 +88,38 @@ pub enum InputUser {
 }
 
 impl InputInfo {
+    /// Creates an input without users: a scenario key, its meaning as a noun phrase, and its values in the scenario, 1 to
+    /// [`COMPONENTS_MAX`].
+    pub fn new(
+        key: impl Into<String>,
+        variability: Variability,
+        description: impl Into<Cow<'static, str>>,
+        initial: &[f64],
+    ) -> Self {
+        let range = (f64::NEG_INFINITY, f64::INFINITY);
+        let (key, description, initial) = (key.into(), description.into(), initial.to_vec());
+        Self { key, description, variability, initial, range, uses: Vec::new(), response: None }
+    }
+
+    /// Sets the least and the largest value of a component.
+    #[must_use]
+    pub fn within(self, least: f64, largest: f64) -> Self {
+        Self { range: (least, largest), ..self }
+    }
+
+    /// Adds users that know the input under the number `port`.
+    #[must_use]
+    pub fn used_by(mut self, users: impl IntoIterator<Item = InputUser>, port: usize) -> Self {
+        self.uses.extend(users.into_iter().map(|user| InputUse { user, port }));
+        self
+    }
+
+    /// Sets the quantity that shows the response to a step.
+    #[must_use]
+    pub fn seen_in(self, response: Option<ResponseField>) -> Self {
+        Self { response, ..self }
+    }
+
     /// Returns values as those of an input; missing components are zero.
     pub fn values(components: &[f64]) -> Values {
         let mut values = [0.0; COMPONENTS_MAX];
@@ -285,6 +317,9 @@ pub(crate) enum ShapeName {
     Prbs,
 }
 
+/// The reason and the code of a mistake.
+pub(crate) type Mistake = (String, &'static str);
+
 /// The settings against which changes are checked.
 pub(crate) struct Setting<'a> {
     pub infos: &'a [InputInfo],
@@ -292,7 +327,7 @@ pub(crate) struct Setting<'a> {
     pub last_tick: u64,
     pub seed: u64,
     /// Returns the mistakes of the scenario if the key has this value.
-    pub probe: &'a dyn Fn(&str, Value) -> Vec<(String, &'static str)>,
+    pub probe: &'a dyn Fn(&str, Value) -> Vec<Mistake>,
 }
 
 /// Checks all changes of a scenario, and returns them in the order of their ticks. Refused ones are recorded and left out.

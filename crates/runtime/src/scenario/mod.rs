@@ -23,8 +23,8 @@ use crate::config::accept::{self, Accept};
 use crate::config::hosts::{self, Hosts};
 use crate::config::raw::{Launch, Policy, Raw};
 use crate::config::{
-    BodyInfo, Checks, ClockKind, ConfigError, Cores, Document, InputInfo, InputUse, InputUser, Inputs, NotExternal,
-    Realtime, Settings, Shape, Supervision, Variability, fault, input, nearest, watchdog,
+    BodyInfo, Checks, ClockKind, ConfigError, Cores, Document, InputInfo, InputUser, Inputs, NotExternal, Realtime,
+    Settings, Shape, Supervision, Variability, fault, input, nearest, watchdog,
 };
 use crate::control::{ACTUATION_DELAY_MAX, WatchBounds};
 use crate::rig::Context;
@@ -241,20 +241,15 @@ impl Scenario {
 /// Returns the switch that demands the safe command of every driven body; `None` if the scenario drives no body.
 fn safe_switch(raw: &Raw, bodies: &[BodyInfo]) -> Option<InputInfo> {
     let driven = bodies.iter().enumerate().filter(|(_, body)| body.driven);
-    let uses: Vec<_> = driven.map(|(index, _)| InputUse { user: InputUser::Actuator(index), port: 0 }).collect();
-    (!uses.is_empty()).then(|| InputInfo {
-        key: "actuator.safe".to_owned(),
-        description: "actuators apply the safe command; false re-arms them".into(),
-        variability: Variability::Switch,
-        initial: vec![f64::from(u8::from(raw.actuator.safe))],
-        range: (0.0, 1.0),
-        uses,
-        response: None,
-    })
+    let description = "actuators apply the safe command; false re-arms them";
+    let initial = [f64::from(u8::from(raw.actuator.safe))];
+    let input = InputInfo::new("actuator.safe", Variability::Switch, description, &initial).within(0.0, 1.0);
+    let input = input.used_by(driven.map(|(index, _)| InputUser::Actuator(index)), 0);
+    (!input.uses.is_empty()).then_some(input)
 }
 
 /// Returns the mistakes of a scenario in which a key has another value: reason and code of each.
-fn mistakes(base: &Document, key: &str, value: toml::Value) -> Vec<(String, &'static str)> {
+fn mistakes(base: &Document, key: &str, value: toml::Value) -> Vec<input::Mistake> {
     let mut changed = base.clone();
     let place = changed.place(key);
     let resolved = changed.put(key, value, &place).and_then(|()| Scenario::resolve(changed));

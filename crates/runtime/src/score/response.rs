@@ -138,7 +138,7 @@ impl Observed {
         let deviation = |value: f64| (value - target).abs();
         let deviation_max = known().map(|(_, value)| deviation(value)).fold(0.0, f64::max);
         let band = SETTLED_PART * if self.field.disturbs { deviation_max } else { step.abs() };
-        let last_outside = known().filter(|(_, value)| deviation(*value) > band).last().map(|(tick, _)| tick);
+        let last_outside = known().rfind(|(_, value)| deviation(*value) > band).map(|(tick, _)| tick);
         let settled = last_outside.map_or(0, |tick| tick + 1);
         let time_s = |ticks: usize| ticks as f64 * tick_s;
         let crossing = |part: f64| known().find(|(_, value)| (value - self.from) / step >= part).map(|(tick, _)| tick);
@@ -158,7 +158,7 @@ impl Observed {
             rise_time_s,
             overshoot: (!self.field.disturbs).then_some(excess),
             settling_time_s: (settled < self.values.len()).then(|| time_s(settled)),
-            steady_state_error: known().last().map_or(f64::NAN, |(_, value)| deviation(value)),
+            steady_state_error: known().next_back().map_or(f64::NAN, |(_, value)| deviation(value)),
             deviation_max,
             command_max: self.command_max,
         }

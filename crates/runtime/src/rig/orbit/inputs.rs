@@ -2,12 +2,12 @@
 
 use super::OrbitRig;
 use super::roles::{Aim, port};
-use crate::config::{InputInfo, InputUse, InputUser, ResponseField, Variability};
+use crate::config::{InputInfo, InputUser, ResponseField, Variability};
 use crate::rig::filter::FilterDesign;
 
 /// Returns the inputs of a rig.
 pub(super) fn inputs(rig: &OrbitRig) -> Vec<InputInfo> {
-    let laws = |port| rig.driven().map(move |index| InputUse { user: InputUser::Law(index), port }).collect();
+    let laws = || rig.driven().map(InputUser::Law);
     let mut inputs = Vec::new();
     if let Some(controller) = &rig.controller {
         let gains = &controller.gains;
@@ -16,51 +16,27 @@ pub(super) fn inputs(rig: &OrbitRig) -> Vec<InputInfo> {
             ("radial_per_s", "gain on the radial velocity, 1/s", gains.radial_per_s, port::RADIAL_GAIN),
             ("transverse_per_s", "gain on the transverse velocity, 1/s", gains.transverse_per_s, port::TRANSVERSE_GAIN),
         ] {
-            inputs.push(InputInfo {
-                key: format!("controller.gain.{name}"),
-                description: description.into(),
-                variability: Variability::Tunable,
-                initial: vec![value],
-                range: (0.0, f64::INFINITY),
-                uses: laws(port),
-                response: None,
-            });
+            let input = InputInfo::new(format!("controller.gain.{name}"), Variability::Tunable, description, &[value]);
+            inputs.push(input.within(0.0, f64::INFINITY).used_by(laws(), port));
         }
     }
     if let Aim::Circle { radius, .. } = rig.aim {
-        let uses: Vec<InputUse> = laws(port::TARGET);
-        inputs.push(InputInfo {
-            key: "controller.target_radius_du".to_owned(),
-            description: "set point: radius of the circular orbit, du".into(),
-            variability: Variability::Input,
-            initial: vec![radius],
-            range: (0.0, f64::INFINITY),
-            uses: uses.into_iter().chain([InputUse { user: InputUser::Score, port: port::TARGET }]).collect(),
-            response: response(rig, 0, false),
-        });
+        let (key, description) = ("controller.target_radius_du", "set point: radius of the circular orbit, du");
+        let input = InputInfo::new(key, Variability::Input, description, &[radius]).within(0.0, f64::INFINITY);
+        let input = input.used_by(laws().chain([InputUser::Score]), port::TARGET);
+        inputs.push(input.seen_in(response(rig, 0, false)));
     }
-    if let FilterDesign::First(rates) = rig.filter {
-        inputs.push(InputInfo {
-            key: "observer.decay_rate_per_s".to_owned(),
-            description: "rates at which the errors of the estimated velocity decay, per inertial axis, 1/s".into(),
-            variability: Variability::Tunable,
-            initial: rates.to_vec(),
-            range: (0.0, f64::INFINITY),
-            uses: vec![InputUse { user: InputUser::Observer, port: port::DECAY }],
-            response: None,
-        });
+    if let FilterDesign::First(rates) = &rig.filter {
+        let description = "rates at which the errors of the estimated velocity decay, per inertial axis, 1/s";
+        let input = InputInfo::new("observer.decay_rate_per_s", Variability::Tunable, description, rates);
+        inputs.push(input.within(0.0, f64::INFINITY).used_by([InputUser::Observer], port::DECAY));
     }
     for (index, body) in rig.bodies.iter().enumerate() {
         let table = if index == 0 { body.name.to_string() } else { format!("follower.{}", index - 1) };
-        inputs.push(InputInfo {
-            key: format!("{table}.disturbance_du_s2"),
-            description: "disturbance per mass, radial and transverse, du/s²".into(),
-            variability: Variability::Input,
-            initial: rig.disturbances_du_s2[index].as_slice().to_vec(),
-            range: (f64::NEG_INFINITY, f64::INFINITY),
-            uses: vec![InputUse { user: InputUser::Body(index), port: port::DISTURBANCE }],
-            response: response(rig, index, true),
-        });
+        let (key, disturbance) = (format!("{table}.disturbance_du_s2"), rig.disturbances_du_s2[index].as_slice());
+        let description = "disturbance per mass, radial and transverse, du/s²";
+        let input = InputInfo::new(key, Variability::Input, description, disturbance);
+        inputs.push(input.used_by([InputUser::Body(index)], port::DISTURBANCE).seen_in(response(rig, index, true)));
     }
     inputs
 }

@@ -2,7 +2,7 @@
 
 use super::RigidBodyRig;
 use super::design::ObserverDesign;
-use crate::config::{InputInfo, InputUse, InputUser, ResponseField, Variability};
+use crate::config::{InputInfo, InputUser, ResponseField, Variability};
 use crate::rate::port;
 use crate::rig::filter::FilterDesign;
 use nalgebra::Vector3;
@@ -14,61 +14,39 @@ fn score_port(index: usize, port: usize) -> usize {
 
 /// Returns the inputs of a rig.
 pub(super) fn inputs(rig: &RigidBodyRig) -> Vec<InputInfo> {
-    let driven = || (1..rig.bodies.len()).filter(|index| rig.bodies[*index].driven);
-    let laws = |port: usize| driven().map(move |index| InputUse { user: InputUser::Law(index), port });
-    let score = |index: usize, port: usize| InputUse { user: InputUser::Score, port: score_port(index, port) };
+    let laws = || (1..rig.bodies.len()).filter(|index| rig.bodies[*index].driven).map(InputUser::Law);
+    let score = |input: InputInfo, index: usize, port| input.used_by([InputUser::Score], score_port(index, port));
     let mut inputs = Vec::new();
     if let Some(controller) = &rig.controller {
-        inputs.push(InputInfo {
-            key: "controller.gain_per_s".to_owned(),
-            description: "gains of the law about the three axes, 1/s".into(),
-            variability: Variability::Tunable,
-            initial: controller.gain_per_s.as_slice().to_vec(),
-            range: (0.0, f64::INFINITY),
-            uses: laws(port::GAIN).chain([score(0, port::GAIN)]).collect(),
-            response: None,
-        });
+        let gains = controller.gain_per_s.as_slice();
+        let description = "gains of the law about the three axes, 1/s";
+        let input = InputInfo::new("controller.gain_per_s", Variability::Tunable, description, gains);
+        inputs.push(score(input.within(0.0, f64::INFINITY).used_by(laws(), port::GAIN), 0, port::GAIN));
     }
-    if let ObserverDesign::Hidden { filter: FilterDesign::First([rate]), .. } = &rig.observer {
-        let observer = InputUse { user: InputUser::Observer, port: port::DECAY };
-        inputs.push(InputInfo {
-            key: "observer.decay_rate_per_s".to_owned(),
-            description: "rate at which the error of the estimate decays, 1/s".into(),
-            variability: Variability::Tunable,
-            initial: vec![*rate],
-            range: (0.0, f64::INFINITY),
-            uses: std::iter::once(observer).chain(laws(port::DECAY)).chain([score(0, port::DECAY)]).collect(),
-            response: None,
-        });
+    if let ObserverDesign::Hidden { filter: FilterDesign::First(rate), .. } = &rig.observer {
+        let description = "rate at which the error of the estimate decays, 1/s";
+        let input = InputInfo::new("observer.decay_rate_per_s", Variability::Tunable, description, rate);
+        let users = std::iter::once(InputUser::Observer).chain(laws());
+        inputs.push(score(input.within(0.0, f64::INFINITY).used_by(users, port::DECAY), 0, port::DECAY));
     }
-    for index in 0..rig.bodies.len() {
-        let body = if index == 0 { "leader".to_owned() } else { format!("follower.{}", index - 1) };
-        if rig.bodies[index].driven {
+    for (index, body) in rig.bodies.iter().enumerate() {
+        let table = if index == 0 { "leader".to_owned() } else { format!("follower.{}", index - 1) };
+        if body.driven {
+            let (key, offset) = (format!("{table}.offset_rad_s"), rig.offsets_rad_s[index].as_slice());
+            let description = "set point: rate relative to the leader, in the body's axes, rad/s";
             let largest = (rig.limits.rate_rad_s - rig.rate_bound_rad_s()).max(0.0);
-            let law = InputUse { user: InputUser::Law(index), port: port::OFFSET };
-            inputs.push(InputInfo {
-                key: format!("{body}.offset_rad_s"),
-                description: "set point: rate relative to the leader, in the body's axes, rad/s".into(),
-                variability: Variability::Input,
-                initial: rig.offsets_rad_s[index].as_slice().to_vec(),
-                range: (-largest, largest),
-                uses: vec![law, score(index, port::OFFSET)],
-                response: response(rig, index, false),
-            });
+            let input = InputInfo::new(key, Variability::Input, description, offset).within(-largest, largest);
+            let input = input.used_by([InputUser::Law(index)], port::OFFSET).seen_in(response(rig, index, false));
+            inputs.push(score(input, index, port::OFFSET));
         }
         let played = index == 0 && rig.playback.is_some();
-        if rig.bodies[index].fleet.is_none() && !played {
+        if body.fleet.is_none() && !played {
+            let (key, disturbance) = (format!("{table}.disturbance_rad_s2"), rig.disturbances_rad_s2[index].as_slice());
+            let description = "disturbance torque over inertia, in the body's axes, rad/s²";
             let largest = rig.limits.acceleration_rad_s2;
-            let plant = InputUse { user: InputUser::Body(index), port: port::DISTURBANCE };
-            inputs.push(InputInfo {
-                key: format!("{body}.disturbance_rad_s2"),
-                description: "disturbance torque over inertia, in the body's axes, rad/s²".into(),
-                variability: Variability::Input,
-                initial: rig.disturbances_rad_s2[index].as_slice().to_vec(),
-                range: (-largest, largest),
-                uses: vec![plant, score(index, port::DISTURBANCE)],
-                response: response(rig, index, true),
-            });
+            let input = InputInfo::new(key, Variability::Input, description, disturbance).within(-largest, largest);
+            let input = input.used_by([InputUser::Body(index)], port::DISTURBANCE).seen_in(response(rig, index, true));
+            inputs.push(score(input, index, port::DISTURBANCE));
         }
     }
     inputs
