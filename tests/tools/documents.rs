@@ -10,7 +10,7 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 
 /// Commands that are not run here: first words, and where the command is run or why it cannot be.
-const ELSEWHERE: [(&str, &str); 32] = [
+const ELSEWHERE: [(&str, &str); 33] = [
     ("corotate run pair.toml --host", "it waits for another host; tests/runs/hosts"),
     ("corotate run pair.toml --clock lockstep --debug", "it waits for a debugger; tests/runs/debugging.rs"),
     ("corotate join", "it needs a run to join; tests/runs/hosts"),
@@ -38,6 +38,7 @@ const ELSEWHERE: [(&str, &str); 32] = [
     ("cargo run --release --example serial_device", "it needs a line; tests/runs/serial.rs"),
     ("corotate why", "it needs a run with late ticks; tests/tools/late.rs"),
     ("corotate watch --once", "during a run, below"),
+    ("corotate run rigid-pair --duration 600", "it takes ten minutes; the commands below it have a run of their own"),
     ("corotate watch runs/pair", "a screen that is left by a key; tests/tools/watch.rs, in a terminal"),
     ("corotate watch", "a screen that is left by a key; tests/tools/watch.rs, in a terminal"),
     ("corotate new two-motors", "tests/run"),
@@ -48,7 +49,12 @@ const ELSEWHERE: [(&str, &str); 32] = [
     ("packaging/", "it needs Docker or cargo-deb"),
 ];
 /// Commands that need a run.
-const DURING_A_RUN: [&str; 4] = [
+const DURING_A_RUN: [&str; 9] = [
+    "corotate get",
+    "corotate set actuator.safe=true",
+    "corotate set --save pair.toml",
+    "corotate set controller.gain_per_s=[6,6,6]",
+    "corotate set follower.0.offset_rad_s=[0,0,0.2] --ramp 2",
     "corotate record --out part.mcap",
     "corotate watch --once 0.5",
     "corotate watch --once 0.5 --json",
@@ -236,6 +242,7 @@ pages! {
     debugging: "docs/debugging.md",
     foreign_role: "docs/foreign-role.md",
     hosts: "docs/hosts.md",
+    inputs: "docs/inputs.md",
     formats: "docs/formats.md",
     foxglove: "docs/foxglove.md",
     own_data: "docs/own-data.md",
