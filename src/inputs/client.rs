@@ -4,6 +4,7 @@ use super::protocol::{Answer, LINE_MAX, Request, WantedChange};
 use super::server::socket_path;
 use crate::config::{ConfigError, Document};
 use crate::scenario::{Scenario, claims};
+use crate::seat::scenario_of;
 use std::collections::BTreeMap;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::os::unix::net::UnixStream;
@@ -48,7 +49,9 @@ pub enum InputError {
     #[error(transparent)]
     Value(#[from] ConfigError),
     /// The loop would not converge.
-    #[error("with these values the loop of {body} does not converge: {reason}; give --force to set them all the same")]
+    #[error(
+        "with these values the loop of {body} does not converge: {reason}; force the change to set them all the same"
+    )]
     Unstable {
         /// The driven body.
         body: String,
@@ -78,6 +81,42 @@ impl InputError {
     }
 }
 
+impl From<Answer> for InputError {
+    /// Returns the error of an answer that is not the expected one.
+    fn from(answer: Answer) -> Self {
+        match answer {
+            Answer::Refused { code, reason } => Self::Refused { code, reason },
+            _ => Self::Malformed { reason: "it answers another request".to_owned() },
+        }
+    }
+}
+
+/// Changes inputs of the run in a domain's directory, all at the same tick: checks the values against the run's scenario and its
+/// present values, then asks the launcher. `force` allows values with which the loop does not converge.
+///
+/// # Errors
+/// [`InputError`].
+pub fn change(
+    root: &Path,
+    mut changes: Vec<WantedChange>,
+    at_tick: Option<u64>,
+    force: bool,
+) -> Result<Answer, InputError> {
+    let scenario = scenario_of(root)?;
+    for change in &mut changes {
+        let refused = |reason| InputError::Refused { code: "not-tunable".to_owned(), reason };
+        let (_, info) = scenario.inputs.find(&change.key).map_err(refused)?;
+        change.key.clone_from(&info.key);
+        if !change.ramp_s.is_finite() {
+            let reason = "the length of a ramp is out of range; give 0 s or more".to_owned();
+            return Err(InputError::Refused { code: "out-of-range".to_owned(), reason });
+        }
+    }
+    let (_, values) = current(root)?;
+    Tuned::new(&scenario, &values)?.check(&changes, force)?;
+    request(root, &Request::Set { changes, at_tick })
+}
+
 /// Sends a request to the launcher of the run in a domain's directory.
 ///
 /// # Errors
@@ -98,7 +137,7 @@ pub fn request(root: &Path, request: &Request) -> Result<Answer, InputError> {
         return Err(unreachable(io::ErrorKind::UnexpectedEof.into()));
     }
     match serde_json::from_str(&line) {
-        Ok(Answer::Refused { code, reason }) => Err(InputError::Refused { code, reason }),
+        Ok(refusal @ Answer::Refused { .. }) => Err(refusal.into()),
         Ok(answer) => Ok(answer),
         Err(error) => Err(InputError::Malformed { reason: error.to_string() }),
     }
@@ -111,7 +150,7 @@ pub fn request(root: &Path, request: &Request) -> Result<Answer, InputError> {
 pub fn current(root: &Path) -> Result<(u64, BTreeMap<String, Value>), InputError> {
     match request(root, &Request::Get)? {
         Answer::Values { tick, values } => Ok((tick, values)),
-        _ => Err(InputError::Malformed { reason: "it has no values".to_owned() }),
+        answer => Err(answer.into()),
     }
 }
 

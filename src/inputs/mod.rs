@@ -10,6 +10,6 @@ mod protocol;
 mod server;
 
 pub use applied::{AppliedChange, applied};
-pub use client::{InputError, Tuned, current, request};
+pub use client::{InputError, Tuned, change, current, request};
 pub use protocol::{Answer, Request, WantedChange};
-pub(crate) use server::{InputServer, Timing};
+pub(crate) use server::{InputServer, Timing, resolve};

@@ -213,8 +213,15 @@ fn role(user: InputUser) -> Option<RoleId> {
     }
 }
 
-/// Returns a wanted change, without its tick.
-fn resolve(scenario: &Settings, wanted: &WantedChange, is_absent: &dyn Fn(RoleId) -> bool) -> Result<Change, Answer> {
+/// Returns a wanted change, with tick 0.
+///
+/// # Errors
+/// A refusal. `is_absent` returns true for a role that takes no inputs.
+pub(crate) fn resolve(
+    scenario: &Settings,
+    wanted: &WantedChange,
+    is_absent: &dyn Fn(RoleId) -> bool,
+) -> Result<Change, Answer> {
     let (input, info) = scenario.inputs.find(&wanted.key).map_err(|reason| Answer::refused("not-tunable", reason))?;
     let InputInfo { key, .. } = info;
     let values =

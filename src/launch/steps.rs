@@ -6,7 +6,10 @@ use super::{LaunchError, Outcome};
 use crate::bus::Port;
 use crate::bus::memory::MemoryBus;
 use crate::bus::{BusError, Reader, Signal, WordReader};
-use crate::config::ClockKind;
+use crate::changes::{CHANGES_MAX, ReceivedChanges};
+use crate::config::{ClockKind, InputInfo, InputUser, Variability};
+use crate::input::Change;
+use crate::inputs::{InputError, WantedChange, resolve};
 use crate::runtime::{
     ReadyNode, RoleFunction, RoleId, RoleImpl, TickSamples, depths, ports, private_ledger, report, run_in_turn,
 };
@@ -18,6 +21,8 @@ use crate::score::Scorer;
 use crate::telemetry::Ledger;
 use std::cell::RefCell;
 use std::rc::Rc;
+use std::sync::Arc;
+use toml::Value;
 
 /// A run that its caller steps.
 ///
@@ -53,6 +58,8 @@ pub struct Steps {
     commands: Rc<RefCell<Vec<Vec<u64>>>>,
     truths: Vec<TruthReader>,
     tick: u64,
+    /// True from `observe` to `act`.
+    observed: bool,
     _bus: MemoryBus,
 }
 
@@ -123,6 +130,7 @@ impl Steps {
     /// [`LaunchError`]; [`LaunchError::NotStepped`] if it has no controller, a fleet, or a role that a fault kills.
     pub fn new(mut scenario: Scenario) -> Result<Self, LaunchError> {
         scenario.clock = ClockKind::InProcess;
+        scenario.inputs.receive_in(ReceivedChanges::default());
         let refuse = |reason| Err(LaunchError::NotStepped { reason });
         let roles = RoleId::all(&scenario);
         if !roles.contains(&RoleId::Controller) {
@@ -155,7 +163,20 @@ impl Steps {
         let written = seats.iter().flat_map(|(role, _)| ports(&scenario, *role).writes);
         let truths = written.filter(|port| port.topic.signal == Signal::Truth);
         let truths = truths.map(|port| TruthReader::new(&port, &bus)).collect::<Result<_, _>>()?;
-        Ok(Self { scenario, seats, nodes, scorer, readers, inputs, outputs, commands, truths, tick: 0, _bus: bus })
+        Ok(Self {
+            scenario,
+            seats,
+            nodes,
+            scorer,
+            readers,
+            inputs,
+            outputs,
+            commands,
+            truths,
+            tick: 0,
+            observed: false,
+            _bus: bus,
+        })
     }
 
     /// Runs bodies and observer of the next tick, up to the controller's turn. Returns false after the last tick.
@@ -183,6 +204,7 @@ impl Steps {
             }
         }
         self.truths.iter_mut().try_for_each(|truth| truth.read(&self.scenario))?;
+        self.observed = true;
         Ok(true)
     }
 
@@ -228,7 +250,45 @@ impl Steps {
         }
         self.scorer.poll(1)?;
         self.tick += 1;
+        self.observed = false;
         Ok(())
+    }
+
+    /// Changes an input from the tick on that [`observe`](Self::observe) runs next, and returns this tick. A change after the last
+    /// tick has no effect. The caller is the controller: it applies set points itself, and has no gains that could change.
+    ///
+    /// ```
+    /// # use corotate::{config::SHIPPED, launch::Steps, scenario::Scenario};
+    /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+    /// # let overrides = ["clock=in-process", "duration_s=1", "accept={}"].map(str::to_owned);
+    /// let mut steps = Steps::new(Scenario::parse(SHIPPED[0].1, "rigid-pair.toml", &overrides)?)?;
+    /// steps.observe()?;
+    /// assert_eq!(steps.set_input("follower.0.disturbance_rad_s2", &vec![0.0, 0.0, 0.05].into())?, 1);
+    /// # Ok(())
+    /// # }
+    /// ```
+    ///
+    /// # Errors
+    /// [`InputError::Refused`]: the key is not that of an input, the value is out of range, only the controller uses the parameter, or
+    /// the run has taken all changes that it can take.
+    pub fn set_input(&mut self, key: &str, value: &Value) -> Result<u64, InputError> {
+        let refused = |code: &str, reason| InputError::Refused { code: code.to_owned(), reason };
+        let wanted = WantedChange { key: key.to_owned(), value: value.clone(), ramp_s: 0.0 };
+        let change = resolve(&self.scenario, &wanted, &|_| false)?;
+        if self.scenario.inputs.infos.get(change.input).is_some_and(is_of_controller) {
+            let reason = format!("{key} is used by the controller, which the caller is: it has no effect");
+            return Err(refused("external-role", reason));
+        }
+        let tick = self.tick + u64::from(self.observed);
+        match self.received().append(&[Change { tick, ..change }], || true) {
+            true => Ok(tick),
+            false => Err(refused("too-many", format!("a run takes at most {CHANGES_MAX} changes; start another run"))),
+        }
+    }
+
+    /// Returns the changes of inputs so far, to share them with another copy of the scenario.
+    pub fn received(&self) -> Arc<ReceivedChanges> {
+        self.scenario.inputs.received()
     }
 
     /// Ends the run at any tick, and returns its scores and counters.
@@ -255,6 +315,12 @@ impl Steps {
             signal: 0,
         })
     }
+}
+
+/// Returns true if no role but the controller uses the parameter. A set point is not a parameter: the score uses it too.
+fn is_of_controller(info: &InputInfo) -> bool {
+    let elsewhere = |user| matches!(user, InputUser::Body(_) | InputUser::Actuator(_) | InputUser::Observer);
+    info.variability == Variability::Tunable && !info.uses.iter().any(|by| elsewhere(by.user))
 }
 
 /// Length of a stamp, words.

@@ -3,7 +3,7 @@
 use super::output::{CommandResult, Exit, Failure, fail, harmless, remark, say};
 use super::runs;
 use crate::config::{Document, Variability};
-use crate::inputs::{Answer, InputError, Request, Tuned, WantedChange, current, request};
+use crate::inputs::{Answer, InputError, WantedChange, change, current};
 use crate::scenario::Scenario;
 use crate::seat::{scenario_of, write_whole};
 use std::collections::BTreeMap;
@@ -83,7 +83,8 @@ pub fn set(arguments: &SetArguments) -> CommandResult {
     if changes.is_empty() {
         return save(&root, arguments);
     }
-    let answer = change(&root, changes.clone(), arguments).map_err(|error| fail(exit_of(&error), failure(&error)))?;
+    let answer = change(&root, changes.clone(), arguments.at, arguments.force);
+    let answer = answer.map_err(|error| fail(exit_of(&error), failure(&error)))?;
     save(&root, arguments)?;
     if arguments.json {
         return say(&format!("{}\n", serde_json::to_string(&answer).expect("plain values are JSON")));
@@ -171,18 +172,6 @@ fn edited(value: &Value) -> toml_edit::Value {
         Value::Array(list) => list.iter().filter_map(Value::as_float).collect(),
         value => value.as_float().unwrap_or_default().into(),
     }
-}
-
-/// Checks the changes against the run's scenario and its present values, then asks for them.
-fn change(root: &Path, changes: Vec<WantedChange>, arguments: &SetArguments) -> Result<Answer, InputError> {
-    let scenario = scenario_of(root)?;
-    for change in &changes {
-        let refused = |reason| InputError::Refused { code: "not-tunable".to_owned(), reason };
-        scenario.inputs.find(&change.key).map_err(refused)?;
-    }
-    let (_, values) = current(root)?;
-    Tuned::new(&scenario, &values)?.check(&changes, arguments.force)?;
-    request(root, &Request::Set { changes, at_tick: arguments.at })
 }
 
 /// Prints the values of inputs of a running loop.

@@ -189,12 +189,12 @@ impl Inputs {
         Arc::clone(&self.received.lock().expect("no thread panics while it holds the lock"))
     }
 
-    /// Replaces the list: a run begins.
+    /// Replaces the list by that of a run that begins.
     ///
     /// # Panics
     /// As [`received`](Self::received).
-    pub fn receive_in(&self, list: ReceivedChanges) {
-        *self.received.lock().expect("no thread panics while it holds the lock") = Arc::new(list);
+    pub fn receive_in(&self, list: impl Into<Arc<ReceivedChanges>>) {
+        *self.received.lock().expect("no thread panics while it holds the lock") = list.into();
     }
 
     /// Returns the changes of the scenario and those of the present run.
