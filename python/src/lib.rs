@@ -2,6 +2,7 @@
 //!
 //! Must not decide anything that the library decides.
 
+mod inputs;
 mod logs;
 mod recording;
 mod run;
@@ -27,12 +28,16 @@ fn _corotate(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(logs::reconstruct, module)?)?;
     module.add_function(wrap_pyfunction!(logs::command, module)?)?;
     module.add_function(wrap_pyfunction!(logs::thrust, module)?)?;
+    module.add_function(wrap_pyfunction!(inputs::set_inputs, module)?)?;
+    module.add_function(wrap_pyfunction!(inputs::get_inputs, module)?)?;
     module.add_class::<seat::Ticks>()?;
     module.add_class::<steps::Steps>()?;
     module.add_class::<sweep::Cases>()?;
     module.add_class::<sweep::Results>()?;
     module.add_class::<recording::Recording>()?;
-    module.add("CorotateError", module.py().get_type::<run::CorotateError>())?;
+    let error = module.py().get_type::<run::CorotateError>();
+    error.setattr("code", module.py().None())?;
+    module.add("CorotateError", error)?;
     module.add("build", corotate::campaign::BUILD)?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))
 }

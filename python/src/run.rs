@@ -31,6 +31,12 @@ pub fn failed(error: impl Display) -> PyErr {
     CorotateError::new_err(error.to_string())
 }
 
+/// Returns an exception whose `code` is the stable code of the error.
+pub fn coded(error: impl Display, code: &str) -> PyErr {
+    let error = failed(error);
+    Python::attach(|py| error.value(py).setattr("code", code)).map_or_else(|failure| failure, |()| error)
+}
+
 pub fn refused(error: impl Display) -> PyErr {
     PyValueError::new_err(error.to_string())
 }

@@ -1,5 +1,6 @@
 //! A loop in one thread, stepped by its controller.
 
+use crate::inputs::{refused, value};
 use crate::run::{failed, scenario};
 use crate::seat::{Seat, seat_of};
 use corotate::launch::{Claim, Summary, claim, make_directory, make_latest, new_run, write_run};
@@ -68,6 +69,7 @@ impl Steps {
         let scenario_again = || scenario(given, kind, &overrides);
         let steps = corotate::launch::Steps::new(scenario_again()?).map_err(failed)?;
         let mut scenario = scenario_again()?;
+        scenario.inputs.receive_in(steps.received());
         scenario.run = Some(new_run().map_err(failed)?);
         let ports = corotate::runtime::ports(&scenario, corotate::runtime::RoleId::Controller);
         let numbers = |port: &corotate::bus::Port| {
@@ -174,6 +176,12 @@ impl Steps {
     /// The physical bounds that samples are held against, by name: of measurements, estimates, commands.
     fn limits(&self) -> Vec<(String, f64)> {
         self.scenario.rig.limits().into_iter().map(|limit| (limit.name, limit.value)).collect()
+    }
+
+    /// Changes an input, to a value in TOML, from the next tick on, and returns this tick.
+    fn set_input(&mut self, key: &str, text: &str) -> PyResult<u64> {
+        let value = value(text)?;
+        self.steps()?.set_input(key, &value).map_err(refused)
     }
 
     /// Names the directory for the results, before the first tick.

@@ -12,6 +12,7 @@ import sys as _sys
 
 from . import _corotate, environments as _environments
 from ._corotate import CorotateError, __version__
+from .inputs import Change, get, set
 from .logs import HiddenRate, Identified, OrbitHold, Synchronizer, identify
 from .recording import Recording
 from .run import Run, certificate, run, shipped
@@ -19,8 +20,8 @@ from .seat import Seat
 from .sweep import Sweep, sweep
 
 __all__ = [
-    "CorotateError", "Env", "HiddenRate", "Identified", "OrbitHold", "Recording", "Run", "Seat", "Sweep", "Synchronizer",
-    "__version__", "certificate", "identify", "run", "shipped", "sweep", "to_control",
+    "Change", "CorotateError", "Env", "HiddenRate", "Identified", "OrbitHold", "Recording", "Run", "Seat", "Sweep", "Synchronizer",
+    "__version__", "certificate", "get", "identify", "run", "set", "shipped", "sweep", "to_control",
 ]
 
 # Roles of a run are processes of this interpreter with this package.

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 
 from . import _corotate
-from .scenario import given, overrides, seed_of
+from .scenario import given, overrides, seed_of, toml
 from .seat import Samples
 
 # Limits from the guards, by the beginning of a field's name: of measurements, of estimates, of commands that act.
@@ -108,6 +108,18 @@ class Env(gymnasium.Env):
             self._over = True
             info["reason"] = reason
         return observation, -metric, self._over, False, info
+
+    def set_input(self, key, value):
+        """Changes an input of the episode, such as a disturbance or a set point, and returns the tick from which it acts: the next one.
+
+        `reset` restores the value of the scenario. The caller is the controller: its gains cannot change, and it must follow a set point
+        itself, from which the reward then counts. An episode takes 4096 changes. A CorotateError has the `code` of a refusal.
+        """
+        if self._steps is None:
+            raise RuntimeError("there is no episode: call reset() first")
+        if self._over:
+            raise _corotate.CorotateError("the episode is over: call reset() to begin another")
+        return self._steps.set_input(key, toml(value))
 
     def summary(self):
         """Ends the episode and returns its summary, judged by the scenario's criteria, as `Run.summary`; again the same until `reset`."""
