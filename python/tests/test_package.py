@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import corotate
+import corotate.inputs
 import corotate.logs
 import corotate.run
 import corotate.seat
@@ -17,7 +18,7 @@ from conftest import euler
 RUN = sys.modules["corotate.run"]
 
 
-@pytest.mark.parametrize("module", [corotate, RUN, sys.modules["corotate.seat"], sys.modules["corotate.logs"]])
+@pytest.mark.parametrize("module", [corotate, RUN, *(sys.modules[f"corotate.{name}"] for name in ("inputs", "seat", "logs"))])
 def test_documented_examples_run(module, tmp_path):
     found = doctest.testmod(module, extraglobs={"tmp": tmp_path, "np": np, "euler": euler, "corotate": corotate})
     assert found.attempted > 0 and found.failed == 0
