@@ -139,6 +139,12 @@ def test_an_environment_changes_its_inputs():
         assert code_of(env.set_input, key, value) == code
     summary = env.summary()
     assert [(change["tick"], change["received"]) for change in summary["inputs"]] == [(11, True), (61, True)]
+    scripted = [{"at_s": at_s, "key": DISTURBANCE, "value": value} for at_s, value in ((0.011, [0.0, 0.0, 0.5]), (0.061, [0.0, 0.0, 0.0]))]
+    again = corotate.Env("rigid-pair", set={**AT_REST, "duration_s": 1, "input": scripted})
+    again.reset(seed=1)
+    for _ in range(100):
+        again.step(np.zeros(3))
+    assert again.summary()["state"]["hash"] == summary["state"]["hash"]
 
 
 def test_an_environment_follows_a_new_set_point_in_its_reward():
