@@ -4,8 +4,7 @@
 //! `corotate set` does.
 
 use crate::config::{InputInfo, Variability};
-use crate::inputs::{Answer, Request, Tuned, WantedChange, current, request};
-use crate::scenario::Scenario;
+use crate::inputs::{Answer, InputError, WantedChange, change, current};
 use crate::seat::scenario_of;
 use ratatui::crossterm::event::{KeyCode, KeyEvent};
 use std::collections::BTreeMap;
@@ -73,10 +72,7 @@ impl Tune {
         let (changes, wanted) = channel();
         let (sender, news) = channel();
         let root = root.to_owned();
-        std::thread::Builder::new()
-            .name("tune".to_owned())
-            .spawn(move || talk(&root, &scenario, &wanted, &sender))
-            .ok()?;
+        std::thread::Builder::new().name("tune".to_owned()).spawn(move || talk(&root, &wanted, &sender)).ok()?;
         let (values, typed, message, before) = (BTreeMap::new(), String::new(), String::new(), Vec::new());
         Some(Self { rows, values, selected: 0, typed, message, before, changes, news })
     }
@@ -200,15 +196,15 @@ impl Row {
 }
 
 /// Reads the values at intervals, and asks for changes, until the other end is dropped or the run is over.
-fn talk(root: &Path, scenario: &Scenario, wanted: &Receiver<WantedChange>, news: &Sender<News>) {
+fn talk(root: &Path, wanted: &Receiver<WantedChange>, news: &Sender<News>) {
     loop {
         let asked = match wanted.recv_timeout(READ) {
-            Ok(change) => Some(change),
+            Ok(wanted) => Some(wanted),
             Err(RecvTimeoutError::Timeout) => None,
             Err(RecvTimeoutError::Disconnected) => return,
         };
-        if let Some(change) = asked {
-            let message = ask(root, scenario, change).unwrap_or_else(|error| error.to_string());
+        if let Some(wanted) = asked {
+            let message = ask(root, wanted).unwrap_or_else(|error| error.to_string());
             if news.send(News::Message(message)).is_err() {
                 return;
             }
@@ -220,11 +216,9 @@ fn talk(root: &Path, scenario: &Scenario, wanted: &Receiver<WantedChange>, news:
     }
 }
 
-fn ask(root: &Path, scenario: &Scenario, change: WantedChange) -> Result<String, crate::inputs::InputError> {
-    let (_, values) = current(root)?;
-    Tuned::new(scenario, &values)?.check(std::slice::from_ref(&change), false)?;
-    let text = format!("{} = {}", change.key, change.value);
-    Ok(match request(root, &Request::Set { changes: vec![change], at_tick: None })? {
+fn ask(root: &Path, wanted: WantedChange) -> Result<String, InputError> {
+    let text = format!("{} = {}", wanted.key, wanted.value);
+    Ok(match change(root, vec![wanted], None, false)? {
         Answer::Accepted { tick, time_s, .. } => format!("{text} from tick {tick} ({time_s:.3} s)"),
         _ => text,
     })
