@@ -284,6 +284,11 @@ impl Recording {
         Ok(scenario)
     }
 
+    /// Returns the changes of inputs that the run received.
+    pub fn changes(&self) -> &[Change] {
+        &self.changes
+    }
+
     /// Returns the injected faults of the scenario.
     ///
     /// # Errors

@@ -14,6 +14,7 @@ use crate::runtime::{RoleId, ports, topic, window_ticks};
 use crate::sample::{Field, FieldKind, Health, NO_SAMPLE, RoleState, Stamp, status};
 use crate::scenario::AnyRig;
 use crate::scenario::Scenario;
+use crate::score::TimedView;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
@@ -170,6 +171,8 @@ pub(super) struct Feed {
     taps: Vec<Tap>,
     roles: Vec<RoleFeed>,
     rig: Arc<dyn AnyRig>,
+    /// The rig with the inputs of the scored tick.
+    view: Box<dyn TimedView>,
     faults: Vec<(u64, String)>,
     realtime: bool,
     stride: u64,
@@ -217,6 +220,7 @@ impl Feed {
             taps,
             roles,
             rig: scenario.rig.clone(),
+            view: scenario.rig.timed_view(scenario),
             faults,
             realtime,
             stride: if realtime { (POLL_NS / 2 / scenario.period_ns).max(1) } else { 1 },
@@ -342,7 +346,8 @@ impl Feed {
         let words = |body: usize, signal| with_signal(signal).find(|tap| tap.topic.body == bodies[body].name)?.at(tick);
         let mut values = vec![f64::NAN; model.series.len()];
         let metrics = values.len() - usize::from(model.series.last().is_some_and(|series| series.name == LYAPUNOV));
-        self.rig.score_words(&words, &mut values[..metrics]);
+        self.view.advance(tick);
+        self.view.words().score_words(&words, &mut values[..metrics]);
         model.series.iter_mut().zip(values).for_each(|(series, value)| series.push(value));
         let commands = (0..bodies.len()).filter_map(|body| words(body, Signal::Command));
         let functions = commands.filter_map(|command| self.rig.lyapunov_words(command));

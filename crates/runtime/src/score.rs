@@ -3,12 +3,15 @@
 //! Must not delay the loop, except through the ticks that it permits in lockstep.
 
 mod response;
+mod timed;
 
 pub use response::StepResponse;
+pub use timed::TimedView;
+pub(crate) use timed::timed_view;
 
 use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::Grid;
-use crate::config::{Accept, ChangeLists, InputInfo, InputUser, ResponseField, Settings};
+use crate::config::{Accept, ChangeLists, InputInfo, InputUser, Settings, set_point_of};
 use crate::input::Shape;
 use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth, field_named};
 use crate::role::Guard;
@@ -407,13 +410,7 @@ impl<R: Rig> Scoring<R> {
         let now = self.changes.values_at(&self.infos, tick);
         for change in changes.iter().filter(|change| matches!(change.shape, Shape::Step | Shape::Pulse { .. })) {
             let Some(info) = self.infos.get(change.input) else { continue };
-            let place = |field: ResponseField| (field.body, field.field);
-            let is_set_point = |known: &InputInfo| {
-                known.response.is_some_and(|field| !field.disturbs)
-                    && known.response.map(place) == info.response.map(place)
-            };
-            let set_point = self.infos.iter().position(is_set_point);
-            let set_point = set_point.map_or(&[][..], |number| &now[number]);
+            let set_point = set_point_of(&self.infos, info).map_or(&[][..], |number| &now[number]);
             self.responses.begin(info, tick, (&before[change.input], &now[change.input]), set_point);
         }
     }

@@ -242,14 +242,27 @@ impl ChangeLists {
 
     /// Returns the values of the inputs at a tick.
     pub fn values_at(&self, infos: &[InputInfo], tick: u64) -> Vec<Values> {
+        self.courses_at(infos, tick).iter().map(|course| course.at(tick)).collect()
+    }
+
+    /// Returns the courses of the inputs with all changes up to a tick. They hold until the next change.
+    pub fn courses_at(&self, infos: &[InputInfo], tick: u64) -> Vec<Course> {
         let mut courses: Vec<Course> = infos.iter().map(|info| Course::new(InputInfo::values(&info.initial))).collect();
         for (change, _) in self.all().iter().filter(|(change, _)| change.tick <= tick) {
             if let Some(course) = courses.get_mut(change.input) {
                 course.enter(change);
             }
         }
-        courses.iter().map(|course| course.at(tick)).collect()
+        courses
     }
+}
+
+/// Returns the number of the input that is the set point of the quantity which shows the response to `input`.
+pub fn set_point_of(infos: &[InputInfo], input: &InputInfo) -> Option<usize> {
+    let place = |field: ResponseField| (field.body, field.field);
+    infos.iter().position(|info| {
+        info.response.map(place) == input.response.map(place) && info.response.is_some_and(|field| !field.disturbs)
+    })
 }
 
 fn find<'a>(infos: &'a [InputInfo], key: &str) -> Result<(usize, &'a InputInfo), String> {

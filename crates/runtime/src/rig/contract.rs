@@ -170,6 +170,10 @@ pub trait Rig: Clone + Send + Sync + 'static {
     ) -> Option<(f64, f64)> {
         None
     }
+    /// Returns true if the bound on V̇ applies to the driven body with an index at the present inputs, such as disturbances.
+    fn bound_applies(&self, _index: usize) -> bool {
+        true
+    }
     /// Returns V and the bound on V̇ that the controller published with a command, computed from its inputs.
     fn lyapunov(_command: &Command<Self>) -> Option<(f64, f64)> {
         None

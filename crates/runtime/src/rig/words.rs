@@ -28,6 +28,8 @@ pub trait WordView {
     fn score_words<'a>(&self, words: &dyn Fn(usize, Signal) -> Option<&'a [u64]>, out: &mut [f64]);
     /// Returns V and the bound on V̇ that a command carries, as [`Rig::lyapunov`].
     fn lyapunov_words(&self, command: &[u64]) -> Option<(f64, f64)>;
+    /// Returns true if the bound on V̇ applies to a driven body, as [`Rig::bound_applies`].
+    fn bound_applies(&self, body: usize) -> bool;
     /// Returns how the motion of a single body has ended, as [`Rig::loss`].
     fn loss_words(&self, truth: &[u64]) -> Option<&'static str>;
 }
@@ -87,6 +89,10 @@ impl<R: Rig> WordView for R {
 
     fn lyapunov_words(&self, command: &[u64]) -> Option<(f64, f64)> {
         R::lyapunov(cast(command)?)
+    }
+
+    fn bound_applies(&self, body: usize) -> bool {
+        Rig::bound_applies(self, body)
     }
 
     fn loss_words(&self, truth: &[u64]) -> Option<&'static str> {

@@ -9,7 +9,7 @@ use crate::input::{Change, Course};
 use std::sync::Arc;
 
 /// The inputs that a role, or the scorer, uses.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct RoleInputs {
     scripted: Arc<[Change]>,
     received: Arc<ReceivedChanges>,
@@ -26,7 +26,7 @@ pub struct RoleInputs {
     late: u64,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct UsedInput {
     number: usize,
     components: usize,

@@ -8,7 +8,7 @@ use crate::config::{BodyInfo, InputInfo, Settings, role_names};
 use crate::direct;
 use crate::rig::{CertificateReport, Figure, Picture, Rig, WordView};
 use crate::runtime::{ReadyNode, RoleImpl, build_rig};
-use crate::score::{Score, Scorer, score_rig};
+use crate::score::{Score, Scorer, TimedView, score_rig, timed_view};
 use crate::telemetry::{Ledger, RoleReport};
 use std::any::Any;
 use std::fmt;
@@ -51,6 +51,8 @@ pub trait AnyRig: WordView + Any + Send + Sync {
     /// # Errors
     /// [`BusError::Open`].
     fn scorer(&self, settings: &Settings, bus: AnyBus<'_>) -> Result<Box<dyn Scorer>, BusError>;
+    /// Returns a view of samples as words that follows the inputs of a run.
+    fn timed_view(&self, settings: &Settings) -> Box<dyn TimedView>;
     /// Runs the roles in this thread, on samples that stay in place. Returns `None` if the run needs nodes and links.
     fn direct(
         &self,
@@ -121,6 +123,10 @@ impl<R: Rig> AnyRig for R {
             AnyBus::Memory(bus) => score_rig(self, settings, bus),
             AnyBus::Shared(bus) => score_rig(self, settings, bus),
         }
+    }
+
+    fn timed_view(&self, settings: &Settings) -> Box<dyn TimedView> {
+        timed_view(self, settings)
     }
 
     fn direct(

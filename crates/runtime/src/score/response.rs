@@ -38,7 +38,8 @@ pub struct StepResponse {
     /// The time from the step until the response stays within 2 % of the step, or of the largest deviation after a disturbance, s;
     /// `None` if it does not stay there.
     pub settling_time_s: Option<f64>,
-    /// The distance from the set point at the end, in the unit of the set point.
+    /// The distance from the set point at the end, in the unit of the set point; NaN, null in JSON, if every sample is missing.
+    #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub steady_state_error: f64,
     /// The largest distance from the set point, in its unit.
     pub deviation_max: f64,

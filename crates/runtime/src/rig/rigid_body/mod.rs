@@ -487,14 +487,18 @@ impl Rig for RigidBodyRig {
         follower: &RateTruth,
         estimate: &RateEstimate,
     ) -> Option<(f64, f64)> {
-        // The bound covers neither disturbances nor, in the sampled loop, a follower that is held off the leader's motion.
-        let disturbed = [0, index].iter().any(|body| self.disturbances_rad_s2[*body] != Vector3::zeros());
-        if disturbed || self.offsets_rad_s[index] != Vector3::zeros() {
+        if !self.bound_applies(index) {
             return None;
         }
         let (rate, own) = (Vector3::from(leader.omega_rad_s), Vector3::from(follower.omega_rad_s));
         let hidden_error = rate[self.supplied()] - estimate.omega_rad_s[self.supplied()];
         Some(self.certificate?.lyapunov(&(own - rate), hidden_error))
+    }
+
+    fn bound_applies(&self, index: usize) -> bool {
+        // The bound covers neither disturbances nor, in the sampled loop, a follower that is held off the leader's motion.
+        let disturbed = [0, index].iter().any(|body| self.disturbances_rad_s2[*body] != Vector3::zeros());
+        !disturbed && self.offsets_rad_s[index] == Vector3::zeros()
     }
 
     fn lyapunov(command: &RateCommand) -> Option<(f64, f64)> {
