@@ -64,6 +64,19 @@ impl Axis {
         Self::linear(label, low - room, high + room)
     }
 
+    /// Removes every other label, if there are many, for a plot of small height.
+    pub fn sparse(mut self) -> Self {
+        const MANY: usize = 4;
+        if self.ticks.len() >= MANY {
+            let mut kept = false;
+            self.ticks.retain(|_| {
+                kept = !kept;
+                kept
+            });
+        }
+        self
+    }
+
     /// Returns a logarithmic axis of whole decades over positive values. Smaller values are drawn at its lower end.
     pub fn decades(label: &str, (low, high): (f64, f64)) -> Self {
         let high = if high > 0.0 && high.is_finite() { high.log10().ceil() } else { 0.0 };

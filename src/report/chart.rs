@@ -16,6 +16,9 @@ const ROW: f64 = 12.0;
 const LETTER: f64 = 5.6;
 /// The side of a plot of a plane.
 const SQUARE: f64 = 420.0;
+/// The largest number of changes of inputs that are marked by lines; the height of the ticks that mark more.
+pub const CHANGE_LINES: usize = 40;
+const CHANGE_TICK: f64 = 9.0;
 /// The number of shades of a strip, from 0, the lightest.
 pub const SHADES: usize = 8;
 
@@ -74,6 +77,8 @@ pub struct Marks {
     pub missing: Vec<(f64, f64)>,
     /// The intervals in which the estimate is degraded or unobservable.
     pub unseen: Vec<(f64, f64)>,
+    /// The times at which inputs change, with their descriptions.
+    pub changes: Vec<(f64, String)>,
 }
 
 /// Returns the smallest and largest value of all columns; of positive values only if `positive`.
@@ -113,7 +118,8 @@ impl Size {
     }
 }
 
-fn legend(lines: &[Line]) -> Vec<(&'static str, String)> {
+/// Returns the class and label of every line with a label.
+pub fn legend(lines: &[Line]) -> Vec<(&'static str, String)> {
     lines.iter().filter(|line| !line.label.is_empty()).map(|line| (line.class, line.label.clone())).collect()
 }
 
@@ -125,9 +131,10 @@ pub fn over_time(title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
 /// Draws lines over time in a given size, with the marks.
 pub fn over_time_in(size: Size, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
     let (frame, name) = (size.frame(), size.name());
-    let mut svg = frame.open_over_time(title, x, y);
+    let mut svg = frame.open_over_time(title, x);
     frame.axes(x, y, &mut svg);
     frame.window(
+        y,
         |svg| {
             let _ = write!(svg, "<use href=\"#marks-{name}\"/>");
             lines.iter().for_each(|line| frame.line(line, x, y, svg));
@@ -141,19 +148,20 @@ pub fn over_time_in(size: Size, title: &str, x: &Axis, y: &Axis, lines: &[Line])
 
 /// Draws lines over any axis, without marks.
 pub fn plain(title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
-    plain_in(Size::Half, title, x, y, lines)
+    draw(&Frame::TIME, title, x, y, lines, &[])
 }
 
-/// Draws lines over any axis in a given size, without marks.
-pub fn plain_in(size: Size, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
+/// Draws lines over the logarithm of time, as wide as the page, with the changes of inputs as the only marks.
+pub fn over_log_time(title: &str, x: &Axis, y: &Axis, lines: &[Line], changes: &[(f64, String)]) -> Picture {
     // The rows of labels belong to the linear time axis only.
-    let Size::Whole(_) = size else { return draw(&size.frame(), title, x, y, lines) };
-    Picture { narrow: Some(plain(title, x, y, lines).svg), ..draw(&Size::Whole(0).frame(), title, x, y, lines) }
+    let [wide, half] = [Size::Whole(0), Size::Half].map(|size| draw(&size.frame(), title, x, y, lines, changes));
+    Picture { narrow: Some(half.svg), ..wide }
 }
 
-fn draw(frame: &Frame, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
+fn draw(frame: &Frame, title: &str, x: &Axis, y: &Axis, lines: &[Line], changes: &[(f64, String)]) -> Picture {
     let mut svg = frame.open(title);
     frame.axes(x, y, &mut svg);
+    draw_changes(frame, x, changes, &mut svg);
     lines.iter().for_each(|line| frame.line(line, x, y, &mut svg));
     svg.push_str("</svg>");
     Picture { svg, narrow: None, legend: legend(lines), title: title.to_owned() }
@@ -176,7 +184,7 @@ pub fn plane(title: &str, names: [&str; 2], lines: &[Line], centre: bool) -> Pic
     };
     let frame = Frame::sized(SQUARE + LEFT + RIGHT, SQUARE + TOP + BOTTOM, TOP);
     let (x, y) = (axis(0), axis(1));
-    let mut picture = draw(&frame, title, &x, &y, lines);
+    let mut picture = draw(&frame, title, &x, &y, lines, &[]);
     if centre {
         let (at_x, at_y) = (frame.x(&x, 0.0), frame.y(&y, 0.0));
         let cross =
@@ -212,6 +220,7 @@ fn marks_in(size: Size, x: &Axis, marks: &Marks, svg: &mut String) {
             "<rect class=\"{class}\" x=\"{from:.1}\" y=\"{top}\" width=\"{width:.1}\" height=\"{height}\"/>"
         );
     }
+    draw_changes(&frame, x, &marks.changes, svg);
     for (time, _) in &marks.incidents {
         let at = frame.x(x, *time);
         let _ = write!(svg, "<path class=\"incident\" d=\"M{at:.1} {top}V{foot}\"/>");
@@ -222,6 +231,23 @@ fn marks_in(size: Size, x: &Axis, marks: &Marks, svg: &mut String) {
         let _ = write!(rug, "M{from:.1} {:.1}h{:.1}", foot - 3.0, (to - from).max(1.0));
     }
     let _ = write!(svg, "<path class=\"missing\" d=\"{rug}\"/></g>");
+}
+
+/// Marks the changes of inputs: a line for each, or ticks at the axis if there are many.
+fn draw_changes(frame: &Frame, x: &Axis, changes: &[(f64, String)], svg: &mut String) {
+    let (top, foot) = (frame.top, frame.foot());
+    let at = |(time, _): &(f64, String)| format!("{:.1}", frame.x(x, *time));
+    if changes.len() > CHANGE_LINES {
+        let mut places: Vec<String> = changes.iter().map(at).collect();
+        places.dedup();
+        let ticks: String = places.iter().map(|at| format!("M{at} {foot}v-{CHANGE_TICK}")).collect();
+        let _ = write!(svg, "<path class=\"change\" d=\"{ticks}\"/>");
+        return;
+    }
+    for change in changes {
+        let (at, about) = (at(change), escape(&change.1));
+        let _ = write!(svg, "<path class=\"change\" d=\"M{at} {top}V{foot}\"><title>{about}</title></path>");
+    }
 }
 
 /// Draws the numbers of faults above a small chart, as far as they fit, and a flag for every incident.

@@ -21,10 +21,13 @@ pub fn counterpart(scenario: &Scenario) -> Result<Option<Traces>, ReportError> {
     let failed = |error: &dyn std::fmt::Display| ReportError::Counterpart { reason: error.to_string() };
     let plain = ["clock=in-process", "launch.external=[]", "fault=[]", "accept={}"];
     let overrides: Vec<String> = changes.iter().chain(&plain).map(|change| (*change).to_owned()).collect();
-    let scenario = Scenario::parse(&scenario.to_toml(), "the reference run", &overrides)?;
+    let changes = scenario.inputs.lists().all().into_iter().map(|(change, _)| change).collect();
+    let mut scenario = Scenario::parse(&scenario.to_toml(), "the reference run", &overrides)?;
+    // A run in one thread receives no changes, so those that this run received are part of the reference's scenario.
+    scenario.inputs.scripted = changes;
     let directory = tempfile::tempdir().map_err(|error| failed(&error))?;
     let file = directory.path().join("run.mcap");
     run(&scenario, &mut Launch { record: Some(file.clone()), ..Launch::new(&AtomicUsize::new(0), &mut |_| {}) })
         .map_err(|error| failed(&error))?;
-    Ok(Some(trace(&Recording::open(&file)?, &scenario)?))
+    Ok(Some(trace(&Recording::open(&file)?, &scenario, &[])?))
 }

@@ -57,15 +57,11 @@ impl Frame {
         format!("<svg viewBox=\"0 0 {w} {h}\" role=\"img\" aria-label=\"{title}\">")
     }
 
-    /// Returns the opening tag of a chart that the page's script can zoom: it has the plot's position and the axes' ends.
-    pub fn open_over_time(&self, title: &str, x: &Axis, y: &Axis) -> String {
-        let ([x0, x1], [y0, y1], title) = (x.ends(), y.ends(), escape(title));
-        let Self { width, height, top, left, .. } = self;
-        let (plot_w, plot_h) = (self.plot_width(), self.plot_height());
-        let scale = if y.is_logarithmic() { "log" } else { "linear" };
+    /// Returns the opening tag of a chart that the page's script can zoom: it has the ends of the time axis.
+    pub fn open_over_time(&self, title: &str, x: &Axis) -> String {
+        let (Self { width, height, .. }, [x0, x1], title) = (self, x.ends(), escape(title));
         format!(
-            "<svg viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"{title}\" class=\"time\" \
-             data-plot=\"{left} {top} {plot_w} {plot_h}\" data-x=\"{x0} {x1}\" data-y=\"{y0} {y1}\" data-scale=\"{scale}\">"
+            "<svg viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"{title}\" class=\"time\" data-x=\"{x0} {x1}\">"
         )
     }
 
@@ -82,6 +78,18 @@ impl Frame {
     /// Draws the grid, labels and frame.
     pub fn axes(&self, x: &Axis, y: &Axis, svg: &mut String) {
         self.time_axis(x, svg);
+        self.time_name(x, svg);
+        self.value_axis(y, svg);
+    }
+
+    /// Draws the name of the x axis.
+    pub fn time_name(&self, x: &Axis, svg: &mut String) {
+        let (middle, below, label) = (self.left + self.plot_width() / 2.0, self.height - 8.0, escape(&x.label));
+        let _ = write!(svg, "<text class=\"name\" x=\"{middle}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
+    }
+
+    /// Draws the grid, labels and name of the y axis, and the frame.
+    pub fn value_axis(&self, y: &Axis, svg: &mut String) {
         let (left, top, right, foot) = (self.left, self.top, self.width - self.right, self.foot());
         for (value, label) in &y.ticks {
             let at = self.y(y, *value);
@@ -89,9 +97,6 @@ impl Frame {
             let (beside, below, label) = (left - 6.0, at + 4.0, escape(label));
             let _ = write!(svg, "<text x=\"{beside}\" y=\"{below:.1}\" text-anchor=\"end\">{label}</text>");
         }
-        let (middle, below, label) = ((left + right) / 2.0, self.height - 8.0, escape(&x.label));
-        let _ = write!(svg, "<text class=\"name\" x=\"{middle}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
-        // The label of the y axis.
         let (middle, label) = ((top + foot) / 2.0, escape(&y.label));
         let turn = format!("rotate(-90 14 {middle})");
         let _ = write!(
@@ -114,19 +119,31 @@ impl Frame {
         svg.push_str("</g>");
     }
 
+    /// Draws the grid of the x axis without labels.
+    pub fn time_grid(&self, x: &Axis, svg: &mut String) {
+        svg.push_str("<g class=\"ticks\">");
+        for (value, _) in &x.ticks {
+            let (at, top, foot) = (self.x(x, *value), self.top, self.foot());
+            let _ = write!(svg, "<path class=\"grid\" d=\"M{at:.1} {top}V{foot}\"/>");
+        }
+        svg.push_str("</g>");
+    }
+
     /// Draws the edge of the plot.
     pub fn frame(&self, svg: &mut String) {
         let (left, top, width, height) = (self.left, self.top, self.plot_width(), self.plot_height());
         let _ = write!(svg, "<rect class=\"frame\" x=\"{left}\" y=\"{top}\" width=\"{width}\" height=\"{height}\"/>");
     }
 
-    /// Draws lines and marks in a nested SVG, which clips them at the axes.
-    pub fn window(&self, draw: impl FnOnce(&mut String), svg: &mut String) {
+    /// Draws lines and marks in a nested SVG, which clips them at the axes. It has the ends of the y axis for the page's script.
+    pub fn window(&self, y: &Axis, draw: impl FnOnce(&mut String), svg: &mut String) {
         let (left, top, width, height) = (self.left, self.top, self.plot_width(), self.plot_height());
+        let ([y0, y1], scale) = (y.ends(), if y.is_logarithmic() { "log" } else { "linear" });
         let _ = write!(
             svg,
             "<svg class=\"plot\" x=\"{left}\" y=\"{top}\" width=\"{width}\" height=\"{height}\" \
-             viewBox=\"{left} {top} {width} {height}\" preserveAspectRatio=\"none\">"
+             viewBox=\"{left} {top} {width} {height}\" preserveAspectRatio=\"none\" data-y=\"{y0} {y1}\" \
+             data-scale=\"{scale}\">"
         );
         draw(svg);
         svg.push_str("</svg>");

@@ -92,7 +92,7 @@ mod tests {
     use crate::report::chart::Size;
 
     fn built(report: &LateReport) -> Section {
-        section(report, &Frames { time: &Axis::time(10.0), whole: Size::Whole(0) })
+        section(report, &Frames { time: &Axis::time(10.0), whole: Size::Whole(0), changes: &[] })
     }
 
     fn figures(section: &Section) -> Vec<&(Picture, String)> {

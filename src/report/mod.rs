@@ -14,8 +14,10 @@
 //! | `pictures` | charts from the samples of a run |
 //! | `tables` | tables from the summary |
 //! | `late`, `timeline` | late ticks with their causes; the cores around one |
+//! | `inputs`, `responses` | changes of inputs; charts and figures of the responses to steps |
+//! | `windows` | set point, response and command around a step, tick by tick |
 //! | `campaign` | the page of a campaign |
-//! | `axis`, `frame`, `chart` | charts as SVG |
+//! | `axis`, `frame`, `chart`, `panels` | charts as SVG |
 //! | `html`, `page` | HTML |
 //!
 //! Must not judge a run: the verdict comes from its summary. Must not omit anything silently: a remark names what is missing.
@@ -29,17 +31,21 @@ mod error;
 mod frame;
 mod hidden;
 mod html;
+mod inputs;
 mod late;
 mod model;
 mod page;
 mod pair;
+mod panels;
 mod percentiles;
 mod pictures;
+mod responses;
 mod single;
 mod source;
 mod tables;
 mod timeline;
 mod traces;
+mod windows;
 
 pub use error::ReportError;
 pub use hidden::{HiddenFacts, HiddenPage};

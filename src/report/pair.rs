@@ -7,9 +7,11 @@ use super::chart::{Marks, Picture, Size, marks, over_time, over_time_in, plane, 
 use super::columns::{Columns, Extremes};
 use super::error::ReportError;
 use super::frame::Line;
+use super::inputs::{self, RunView};
 use super::model::{Block, Model, Section, latency_section};
 use super::percentiles::{Curve, pictures};
 use super::pictures::{by_unit, error_axis};
+use super::responses;
 use super::source::Source;
 use super::tables::figures_cells;
 use super::traces::{Key, MetricTrace, Traces, trace};
@@ -17,6 +19,7 @@ use crate::analysis::digits;
 use crate::launch::{MetricScore, StageFigures, Summary};
 use crate::record::{Comparison, RecordError, Recording, Tolerances, diff};
 use crate::rig;
+use crate::score::StepResponse;
 use std::collections::BTreeSet;
 
 /// Line classes of both runs: A is solid and thin, B is dashed and wide, so both are visible where they coincide.
@@ -36,9 +39,10 @@ struct Run<'a> {
 }
 
 impl<'a> Run<'a> {
-    fn new(name: &'static str, source: &'a Source) -> Result<Self, ReportError> {
+    /// Reads a run, with the responses to `steps`.
+    fn new(name: &'static str, source: &'a Source, steps: &[StepResponse]) -> Result<Self, ReportError> {
         let traces = match (&source.recording, &source.scenario) {
-            (Some(recording), Some(scenario)) => Some(trace(recording, scenario)?),
+            (Some(recording), Some(scenario)) => Some(trace(recording, scenario, steps)?),
             _ => None,
         };
         let tick_s = source.scenario.as_ref().map_or(0.0, |scenario| scenario.tick_s());
@@ -57,7 +61,8 @@ impl<'a> Run<'a> {
 
 /// Builds the page of two runs, with the fields named by `shown`.
 pub fn model(a: &Source, b: &Source, shown: &[String]) -> Result<Model, ReportError> {
-    let runs = [Run::new(NAMES[0], a)?, Run::new(NAMES[1], b)?];
+    let steps = responses::drawn(&[a, b]);
+    let runs = [Run::new(NAMES[0], a, &steps[0])?, Run::new(NAMES[1], b, &steps[1])?];
     let compared = match (&a.recording, &b.recording) {
         (Some(a), Some(b)) => Some(compare(a, b)?),
         _ => None,
@@ -65,13 +70,16 @@ pub fn model(a: &Source, b: &Source, shown: &[String]) -> Result<Model, ReportEr
     let first = compared.as_ref().and_then(|found| found.as_ref().ok()).and_then(Comparison::first);
     let time = Axis::time(runs.iter().map(Run::end_s).fold(runs[0].tick_s.max(1e-9), f64::max));
     let flag = first.map(|(_, first)| (first.tick as f64 * runs[0].tick_s, "first difference".to_owned()));
-    let (marks, whole) = marks(&time, &Marks { incidents: flag.into_iter().collect(), ..Marks::default() });
+    let changes = inputs::marks(runs.each_ref().map(|run| (run.name, run.source)), time.ends()[1]);
+    let (marks, whole) = marks(&time, &Marks { incidents: flag.into_iter().collect(), changes, ..Marks::default() });
     let mut sections = vec![verdicts(&runs), scenarios(&runs), differences(compared.as_ref(), runs[0].tick_s)];
     if !shown.is_empty() {
         let figures = shown.iter().map(|name| field(name, &runs, whole, &time)).collect::<Result<_, _>>()?;
         sections.push(Section { id: "fields", title: "Fields", blocks: vec![Block::Figures(figures)] });
     }
     sections.extend([errors(&runs, whole, &time), motion(&runs, &time)]);
+    let views = runs.each_ref().map(|run| RunView { name: run.name, source: run.source, traces: run.traces.as_ref() });
+    sections.push(inputs::section(&views));
     let latencies = pictures(&curves(&runs));
     if !latencies.is_empty() {
         sections.push(latency_section(latencies, latency_rows(&runs)));

@@ -1,7 +1,7 @@
 //! Charts from the samples of a run: motion, errors, V and lateness.
 
 use super::axis::Axis;
-use super::chart::{Picture, SHADES, Size, over_time, over_time_in, plain_in, plane, range, strip};
+use super::chart::{Picture, SHADES, Size, over_log_time, over_time, over_time_in, plane, range, strip};
 use super::columns::{Columns, Extremes};
 use super::error::ReportError;
 use super::frame::Line;
@@ -30,10 +30,11 @@ const COMPARED: &str = "with full state (computed here)";
 
 type Figures = Vec<(Picture, String)>;
 
-/// The time axis of all charts, and the size of page-wide ones.
+/// The time axis of all charts, the size of page-wide ones, and the times at which inputs change, with their descriptions.
 pub struct Frames<'a> {
     pub time: &'a Axis,
     pub whole: Size,
+    pub changes: &'a [(f64, String)],
 }
 
 /// Builds the sections with charts of the samples, of the reference run `full` if there is one, and of the fields named by
@@ -289,7 +290,8 @@ fn errors_in(
         early.iter_mut().flat_map(|line| &mut line.parts).for_each(|part| *part = part.iter().map(later).collect());
         let (title, time) = (format!("{title} over the logarithm of time"), Axis::log_time(tick_s, end_s));
         let caption = "The same errors over the logarithm of time, which shows the first ticks in detail.";
-        figures.push(Block::Figures(vec![(plain_in(frames.whole, &title, &time, &y, &early), caption.to_owned())]));
+        figures
+            .push(Block::Figures(vec![(over_log_time(&title, &time, &y, &early, frames.changes), caption.to_owned())]));
     }
     figures
 }

@@ -4,17 +4,18 @@ use super::axis::Axis;
 use super::chart::{Marks, marks};
 use super::counterpart::counterpart;
 use super::error::ReportError;
+use super::inputs::RunView;
 use super::model::{Model, latency_section};
 use super::pictures::Frames;
 use super::source::Source;
 use super::traces::{Traces, trace};
-use super::{late, percentiles, pictures, tables};
+use super::{inputs, late, percentiles, pictures, responses, tables};
 
 /// Builds the page of a run, with the fields named by `shown`.
 pub fn model(source: &Source, shown: &[String]) -> Result<Model, ReportError> {
     let mut remarks = source.missing.clone();
     let traces = match (&source.recording, &source.scenario) {
-        (Some(recording), Some(scenario)) => Some(trace(recording, scenario)?),
+        (Some(recording), Some(scenario)) => Some(trace(recording, scenario, &responses::drawn(&[source])[0])?),
         _ => None,
     };
     if let Some(damage) = source.recording.as_ref().and_then(|recording| recording.damage()) {
@@ -25,12 +26,13 @@ pub fn model(source: &Source, shown: &[String]) -> Result<Model, ReportError> {
     }
     let (time, events) = times(source, traces.as_ref());
     let (marks, whole) = marks(&time, &events);
-    let frames = Frames { time: &time, whole };
+    let frames = Frames { time: &time, whole, changes: &events.changes };
     let mut sections = vec![tables::verdict(source, traces.as_ref())];
     if let Some(traces) = &traces {
         let full = source.scenario.as_ref().map_or(Ok(None), counterpart)?;
         sections.extend(pictures::sections(source, traces, full.as_ref(), &frames, shown)?);
     }
+    sections.push(inputs::section(&[RunView { name: "", source, traces: traces.as_ref() }]));
     let latencies = percentiles::pictures(&source.curves);
     if !latencies.is_empty() {
         sections.push(latency_section(latencies, tables::latencies(source)));
@@ -96,6 +98,7 @@ fn times(source: &Source, traces: Option<&Traces>) -> (Axis, Marks) {
             .map(|incident| (incident.tick as f64 * tick_s, format!("{} {}", incident.role, incident.action.name())))
             .collect(),
         missing: missing.iter().map(|(from, to)| (*from as f64 * tick_s, *to as f64 * tick_s)).collect(),
+        changes: inputs::marks([("", source)], last as f64 * tick_s),
     };
     (time, marks)
 }

@@ -6,10 +6,12 @@ use super::error::ReportError;
 use super::percentiles::{Curve, read_curve};
 use crate::config::{ClockKind, RunId};
 use crate::files;
+use crate::inputs::{AppliedChange, applied};
 use crate::late::LateReport;
 use crate::launch::{LATE, LATENCY, RECORDING, SCENARIO, SUMMARY, Summary};
 use crate::record::Recording;
 use crate::scenario::Scenario;
+use crate::score::StepResponse;
 use std::fs;
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
@@ -63,11 +65,7 @@ impl Source {
         if summary.is_none() {
             missing.push("summary.json is missing: the run was aborted, or is still running".to_owned());
         }
-        let scenario = match (text(&at(SCENARIO))?, &recording) {
-            (Some(text), _) => Some(Scenario::parse(&text, &at(SCENARIO).display().to_string(), &[])?),
-            (None, Some(recording)) => Some(recording.scenario()?),
-            (None, None) => None,
-        };
+        let scenario = scenario(&at(SCENARIO), recording.as_ref())?;
         if recording.is_none() {
             missing.push(
                 "charts over time are missing: the samples were not recorded; `corotate run FILE --record` writes them \
@@ -115,6 +113,17 @@ impl Source {
         }
     }
 
+    /// Returns the changes of inputs in the order of their ticks.
+    pub fn changes(&self) -> Vec<AppliedChange> {
+        let of_scenario = || self.scenario.as_ref().map_or(Vec::new(), |scenario| applied(scenario));
+        self.summary.as_ref().map_or_else(of_scenario, |summary| summary.inputs.clone())
+    }
+
+    /// Returns the responses to steps of inputs; without a summary there are none.
+    pub fn responses(&self) -> &[StepResponse] {
+        self.summary.as_ref().map_or(&[], |summary| &summary.score.responses)
+    }
+
     /// The identifier of the run.
     pub fn run(&self) -> Option<RunId> {
         let recorded = self.recording.as_ref().and_then(|recording| recording.info().run);
@@ -129,6 +138,14 @@ fn text(path: &Path) -> Result<Option<String>, ReportError> {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
         Err(source) => Err(ReportError::Read { path: path.to_owned(), source }),
     }
+}
+
+/// Reads a scenario, or that of the recording, with the changes of inputs that the recorded run received.
+fn scenario(path: &Path, recording: Option<&Recording>) -> Result<Option<Scenario>, ReportError> {
+    let Some(text) = text(path)? else { return Ok(recording.map(Recording::scenario).transpose()?) };
+    let scenario = Scenario::parse(&text, &path.display().to_string(), &[])?;
+    scenario.inputs.received().append(recording.map_or(&[], Recording::changes), || true);
+    Ok(Some(scenario))
 }
 
 /// Reads the late ticks; returns `None` if the file does not exist.

@@ -4,13 +4,14 @@
 //! and those that a guard rejects. Must not know charts.
 
 use super::columns::{Columns, Corners, Count, Extremes};
+use super::windows::{WindowTrace, windows};
 use crate::bus::Signal;
 use crate::record::{RecordError, Recording, SignalInfo};
 use crate::rig::{Picture, Plane, WordGuard};
 use crate::sample::{Column, FieldKind, Order, Place, Stamp, status};
 use crate::scenario::AnyRig;
 use crate::scenario::Scenario;
-use crate::score::lyapunov_floor;
+use crate::score::{StepResponse, TimedView, lyapunov_floor};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -40,6 +41,8 @@ pub struct Traces {
     pub scored_ticks: u64,
     /// The number of ticks at which the estimate reported a degraded status, by status.
     pub unseen: BTreeMap<&'static str, Columns<Count>>,
+    /// The responses to the given steps.
+    pub windows: Vec<WindowTrace>,
 }
 
 /// The status bits of a degraded estimate.
@@ -70,13 +73,15 @@ pub struct MetricTrace {
     pub settled_max: Option<f64>,
 }
 
-/// Reads the traces of a recording.
+/// Reads the traces of a recording, with the responses to `steps`. The scenario has the changes that the run received.
 ///
 /// # Errors
 /// [`RecordError`], also if the layouts of its samples differ from the scenario's.
-pub fn trace(recording: &Recording, scenario: &Scenario) -> Result<Traces, RecordError> {
+pub fn trace(recording: &Recording, scenario: &Scenario, steps: &[StepResponse]) -> Result<Traces, RecordError> {
     recording.check_layouts(scenario)?;
-    Tracer::new(scenario, recording).run(recording)
+    let mut tracer = Tracer::new(scenario, recording);
+    tracer.traces.windows = windows(steps, scenario, recording);
+    tracer.run(recording)
 }
 
 /// A recorded signal while its samples are read.
@@ -109,8 +114,25 @@ struct Pending {
     estimate: Option<Vec<u64>>,
 }
 
+/// Views of samples with the inputs of their tick. Each of them sees its ticks in order.
+struct Views {
+    complete: Box<dyn TimedView>,
+    incomplete: Box<dyn TimedView>,
+    /// One per body.
+    commands: Vec<Box<dyn TimedView>>,
+}
+
+impl Views {
+    fn new(scenario: &Scenario) -> Self {
+        let view = || scenario.rig.timed_view(scenario);
+        let commands = scenario.rig.bodies().iter().map(|_| view()).collect();
+        Self { complete: view(), incomplete: view(), commands }
+    }
+}
+
 struct Tracer {
     rig: Arc<dyn AnyRig>,
+    views: Views,
     tick_s: f64,
     settled_by_s: f64,
     epoch_ns: u64,
@@ -145,6 +167,7 @@ impl Tracer {
         let signals = recording.signals().iter().map(|signal| SignalTrace::new(&**rig, signal, &mut traces)).collect();
         Self {
             rig: rig.clone(),
+            views: Views::new(scenario),
             tick_s: info.period_ns as f64 / 1e9,
             settled_by_s: scenario.accept.settled_by_s,
             epoch_ns: info.epoch_ns,
@@ -163,7 +186,7 @@ impl Tracer {
     fn run(mut self, recording: &Recording) -> Result<Traces, RecordError> {
         recording.visit(|signal, received_ns, sample| self.take(signal, received_ns, sample))?;
         while let Some((tick, pending)) = self.pending.pop_first() {
-            self.score(tick, &pending);
+            self.score(tick, &pending, false);
         }
         let mut traces = self.traces;
         for field in self.signals.into_iter().flat_map(|signal| signal.fields) {
@@ -248,23 +271,26 @@ impl Tracer {
         if pending.estimate.is_some() && pending.truths.iter().all(Option::is_some) {
             if let Some(whole) = self.pending.remove(&tick) {
                 self.traces.scored_ticks += 1;
-                self.score(tick, &whole);
+                self.score(tick, &whole, true);
             }
         } else if let Some(first) = self.pending.first_entry()
             && first.key().saturating_add(WINDOW_TICKS) < self.newest
         {
             let (tick, part) = first.remove_entry();
-            self.score(tick, &part);
+            self.score(tick, &part, false);
         }
     }
 
-    fn score(&mut self, tick: u64, pending: &Pending) {
+    fn score(&mut self, tick: u64, pending: &Pending, complete: bool) {
         let words = |body: usize, signal| match signal {
             Signal::Truth => pending.truths[body].as_deref(),
             Signal::Estimate => pending.estimate.as_deref(),
             _ => None,
         };
-        self.rig.score_words(&words, &mut self.metrics);
+        let view = if complete { &mut self.views.complete } else { &mut self.views.incomplete };
+        view.advance(tick);
+        view.words().score_words(&words, &mut self.metrics);
+        self.traces.windows.iter_mut().for_each(|window| window.take(tick, |body| words(body, Signal::Truth)));
         let settled = tick as f64 * self.tick_s >= self.settled_by_s;
         for (metric, &value) in self.traces.metrics.iter_mut().zip(&self.metrics).filter(|(_, value)| !value.is_nan()) {
             metric.values.at(tick).take(value);
@@ -278,9 +304,15 @@ impl Tracer {
         }
     }
 
-    /// Adds the decay rate of V from the last command to this one, and its bound.
+    /// Adds the decay rate of V from the last command to this one, and its bound, where the bound applies.
     fn fall(&mut self, body: usize, tick: u64, command: &[u64]) {
-        let Some((v, bound)) = self.rig.lyapunov_words(command) else { return };
+        let view = &mut self.views.commands[body];
+        if view.advance(tick) {
+            // V jumps with an input.
+            self.before.remove(&body);
+        }
+        let lyapunov = view.words().lyapunov_words(command).filter(|_| view.words().bound_applies(body));
+        let Some((v, bound)) = lyapunov else { return };
         let name = &self.traces.bodies[body];
         if let Some((before, v_before, bound)) = self.before.insert(body, (tick, v, bound))
             && before + 1 == tick
