@@ -241,7 +241,7 @@ fn draw_changes(frame: &Frame, x: &Axis, changes: &[(f64, String)], svg: &mut St
         let mut places: Vec<String> = changes.iter().map(at).collect();
         places.dedup();
         let ticks: String = places.iter().map(|at| format!("M{at} {foot}v-{CHANGE_TICK}")).collect();
-        let _ = write!(svg, "<path class=\"change\" d=\"{ticks}\"/>");
+        let _ = write!(svg, "<path class=\"changes\" d=\"{ticks}\"/>");
         return;
     }
     for change in changes {

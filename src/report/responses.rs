@@ -149,7 +149,7 @@ fn figure(group: &Group<'_>, runs: &[RunView<'_>]) -> Option<(Picture, String)> 
     }
     let all = |columns: fn(&WindowTrace) -> &Columns<Extremes>| windows.iter().map(move |(.., trace)| columns(trace));
     let upper = range(all(|window| &window.response).chain(all(|window| &window.set_point)), false);
-    let lines = std::iter::once(first.line(SET_POINT, "set point", &first.set_point)).chain(responses).collect();
+    let lines = std::iter::once(first.set_point_line(SET_POINT, "set point")).chain(responses).collect();
     let upper = Plot { y: axis("response", first.field.field, upper), lines };
     let lower = first.field.command.filter(|_| !commands.is_empty()).map(|field| {
         let y = axis("command", field, range(all(|window| &window.command), false)).sparse();

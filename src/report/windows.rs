@@ -111,6 +111,16 @@ impl WindowTrace {
         [first, last].map(|tick| (tick as f64 - self.step.tick as f64) * self.tick_s)
     }
 
+    /// Returns the set point as a line over the time after the step. It is constant from tick to tick.
+    pub fn set_point_line(&self, class: &'static str, label: &str) -> Line {
+        let mut line = self.line(class, label, &self.set_point);
+        for part in &mut line.parts {
+            let corners = part.windows(2).flat_map(|pair| [(pair[1].0, pair[0].1), pair[1]]);
+            *part = part.first().copied().into_iter().chain(corners).collect();
+        }
+        line
+    }
+
     /// Returns one of the signals as a line over the time after the step.
     pub fn line(&self, class: &'static str, label: &str, columns: &Columns<Extremes>) -> Line {
         let mut line = Line::over_time(class, label, columns, self.tick_s);

@@ -10,4 +10,5 @@ mod documents;
 mod foxglove;
 mod late;
 mod report;
+mod report_inputs;
 mod watch;

@@ -24,22 +24,22 @@ fn report(bench: &Bench, source: &Path, options: &[&str]) -> Done {
 }
 
 /// Writes a report, which must succeed, and returns the page.
-fn page(bench: &Bench, source: &Path) -> String {
+pub(super) fn page(bench: &Bench, source: &Path) -> String {
     let done = report(bench, source, &["--out", "page.html"]);
     assert_eq!((done.code, done.stdout.as_str()), (Some(0), "page.html\n"), "{done:?}");
     std::fs::read_to_string(bench.path("page.html")).unwrap()
 }
 
-fn parse(html: &str) -> Document<'_> {
+pub(super) fn parse(html: &str) -> Document<'_> {
     Document::parse_with_options(html, ParsingOptions { allow_dtd: true, ..ParsingOptions::default() }).unwrap()
 }
 
-fn sections<'a>(page: &'a Document<'_>) -> Vec<&'a str> {
+pub(super) fn sections<'a>(page: &'a Document<'_>) -> Vec<&'a str> {
     let sections = page.descendants().filter(|node| node.has_tag_name("section"));
     sections.map(|node| node.attribute("id").unwrap()).collect()
 }
 
-fn section<'a, 'i>(page: &'a Document<'i>, id: &str) -> Node<'a, 'i> {
+pub(super) fn section<'a, 'i>(page: &'a Document<'i>, id: &str) -> Node<'a, 'i> {
     page.descendants().find(|node| node.has_tag_name("section") && node.attribute("id") == Some(id)).unwrap()
 }
 
@@ -48,13 +48,13 @@ fn text(node: Node<'_, '_>) -> String {
 }
 
 /// Returns the cells of all tables of a section, by row.
-fn rows(section: Node<'_, '_>) -> Vec<Vec<String>> {
+pub(super) fn rows(section: Node<'_, '_>) -> Vec<Vec<String>> {
     let rows = section.descendants().filter(|node| node.has_tag_name("tr"));
     rows.map(|row| row.children().filter(Node::is_element).map(text).collect()).collect()
 }
 
 /// Asserts that the page refers to no other file, and that every figure has a path and a label.
-fn check_page(html: &str) {
+pub(super) fn check_page(html: &str) {
     for outside in ["http:", "https:", "//", "@import", "url("] {
         assert!(!html.contains(outside), "{outside}");
     }
@@ -577,7 +577,7 @@ fn a_comparison_shows_the_first_difference_of_two_runs() {
     assert!(pair_without_fields(&bench, &plain, &orbit).contains("orbit-hold"));
 }
 
-fn pair_without_fields(bench: &Bench, a: &Path, b: &Path) -> String {
+pub(super) fn pair_without_fields(bench: &Bench, a: &Path, b: &Path) -> String {
     report(bench, a, &[b.to_str().unwrap(), "--out", "pair.html"]).succeeded();
     std::fs::read_to_string(bench.path("pair.html")).unwrap()
 }
@@ -614,7 +614,7 @@ document.title = [readout, ticks, !last.startsWith("64 ") && back, svg.querySele
 </script></body>"#;
 
 /// Returns a page after a browser has run its scripts; `None` without a browser.
-fn in_browser(bench: &Bench, html: &str) -> Option<String> {
+pub(super) fn in_browser(bench: &Bench, html: &str) -> Option<String> {
     let browser = ["chromium", "chromium-browser", "google-chrome"].into_iter().find(|name| {
         std::process::Command::new(name).arg("--version").output().is_ok_and(|output| output.status.success())
     })?;
@@ -655,6 +655,9 @@ fn in_a_browser_every_page_fits_a_phone_and_a_screen() {
     let bench = Bench::new();
     let (faulted, plain) =
         (run_recorded(&bench, "faults", &[]), run_recorded(&bench, "rigid-pair", &["--duration", "9"]));
+    let step = r#"input=[{at_s=1.0,key="follower.0.offset_rad_s",value=[0.1,0.0,-0.1]}]"#;
+    let stepped = ["--duration", "3", "--set", step, "--set", "accept={}"];
+    let stepped = run_recorded(&bench, "noisy-pair", &stepped);
     let campaign = "name = \"map\"\nbase = \"rigid-pair\"\nset = { duration_s = 0.5, accept = {} }\n\
                     axis = [{ key = \"tick_hz\", values = [100.0, 200.0] }, { key = \"controller.gain_per_s\", values = [2.0, 4.0] }]\n";
     std::fs::write(bench.path("map.toml"), campaign).unwrap();
@@ -673,6 +676,8 @@ fn in_a_browser_every_page_fits_a_phone_and_a_screen() {
     let pages = [
         ("run", page(&bench, &faulted)),
         ("comparison", pair_without_fields(&bench, &plain, &faulted)),
+        ("inputs", page(&bench, &stepped)),
+        ("tuning", pair_without_fields(&bench, &plain, &stepped)),
         ("campaign", page(&bench, &bench.path("map"))),
         ("log", log),
     ];
@@ -689,7 +694,7 @@ fn in_a_browser_every_page_fits_a_phone_and_a_screen() {
         return common::skipped("the width of pages", "there is no chromium (Debian: apt install chromium)");
     };
     let title = dom.split("<title>").nth(1).and_then(|rest| rest.split("</title>").next()).unwrap();
-    assert_eq!(title, "8 pages;");
+    assert_eq!(title, "12 pages;");
 }
 
 #[test]
