@@ -356,6 +356,22 @@ mod tests {
     }
 
     #[test]
+    fn changes_are_lines_or_ticks_and_take_little_room() {
+        let x = Axis::time(10.0);
+        let drawn = |count: u32| {
+            let change = |n: u32| (10.0 * f64::from(n) / f64::from(count), "<a>&".to_owned());
+            let (svg, _) = marks(&x, &Marks { changes: (0..count).map(change).collect(), ..Marks::default() });
+            roxmltree::Document::parse(&svg).unwrap();
+            let of_class = |class: &str| svg.matches(&format!("class=\"{class}\"")).count();
+            (of_class("change"), of_class("changes"), svg.matches("<title>").count(), svg.len())
+        };
+        let most = CHANGE_LINES;
+        assert_eq!((drawn(most as u32).0, drawn(most as u32).2), (2 * most, 2 * most), "in charts of two sizes");
+        let (lines, ticks, titles, length) = drawn(4096);
+        assert!((lines, ticks, titles) == (0, 2, 0) && length < 200_000, "{length}");
+    }
+
+    #[test]
     fn the_range_of_positive_values_excludes_zero() {
         let mut columns = Columns::<Extremes>::default();
         [0.0, 1e-9, 2.0].iter().enumerate().for_each(|(tick, value)| columns.at(tick as u64).take(*value));

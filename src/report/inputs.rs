@@ -1,8 +1,7 @@
-//! The section with the changes of inputs: their table, their marks on all time axes, and the responses to steps.
+//! The changes of inputs: their table, and their marks on all time axes.
 
 use super::chart::CHANGE_LINES;
-use super::model::{Block, Section};
-use super::responses;
+use super::model::Block;
 use super::source::Source;
 use super::traces::Traces;
 use crate::analysis::digits;
@@ -72,19 +71,18 @@ fn same(a: &AppliedChange, b: &AppliedChange) -> bool {
         == (&b.time_s, &b.key, &b.value, &b.shape, &b.duration_s, &b.received)
 }
 
-/// Builds the section of one run, or of two with their responses side by side.
-pub fn section(runs: &[RunView<'_>]) -> Section {
+/// Returns the text about the marks and the table of changes.
+pub fn blocks(runs: &[RunView<'_>]) -> Vec<Block> {
     let lists: Vec<(&str, Vec<AppliedChange>)> = runs.iter().map(|run| (run.name, run.source.changes())).collect();
     let changes = merged(&lists);
     let mut blocks = Vec::new();
     if !changes.is_empty() && runs.iter().any(|run| run.traces.is_some()) {
         let times = marks(runs.iter().map(|run| (run.name, run.source)), f64::INFINITY).len();
-        let mark = if times > CHANGE_LINES { "A tick at the bottom" } else { "A dotted line" };
-        blocks.push(Block::Text(format!("{mark} of a chart over time marks each change.")));
+        let mark = if times > CHANGE_LINES { "a tick at the bottom" } else { "a dotted line" };
+        blocks.push(Block::Text(format!("Each change is {mark} in charts over time.")));
     }
     blocks.extend(table(&changes, runs.len() > 1));
-    blocks.extend(responses::blocks(runs));
-    Section { id: "inputs", title: "Changes of inputs", blocks }
+    blocks
 }
 
 /// Returns the table of changes, with the names of the runs if there are several.

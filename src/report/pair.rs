@@ -79,7 +79,7 @@ pub fn model(a: &Source, b: &Source, shown: &[String]) -> Result<Model, ReportEr
     }
     sections.extend([errors(&runs, whole, &time), motion(&runs, &time)]);
     let views = runs.each_ref().map(|run| RunView { name: run.name, source: run.source, traces: run.traces.as_ref() });
-    sections.push(inputs::section(&views));
+    sections.push(responses::section(&views));
     let latencies = pictures(&curves(&runs));
     if !latencies.is_empty() {
         sections.push(latency_section(latencies, latency_rows(&runs)));

@@ -6,8 +6,8 @@ use super::axis::Axis;
 use super::chart::{Picture, range};
 use super::columns::{Columns, Extremes};
 use super::frame::Line;
-use super::inputs::{ROWS, RunView, shortened};
-use super::model::Block;
+use super::inputs::{self, ROWS, RunView, shortened};
+use super::model::{Block, Section};
 use super::panels::{Plot, panels};
 use super::source::Source;
 use super::windows::WindowTrace;
@@ -66,8 +66,14 @@ fn is_same_step(a: &StepResponse, b: &StepResponse) -> bool {
     (&a.key, a.component, a.from, a.to) == (&b.key, b.component, b.from, b.to)
 }
 
+/// Builds the section with the changes of inputs and the responses of one run, or of two side by side.
+pub fn section(runs: &[RunView<'_>]) -> Section {
+    let blocks = inputs::blocks(runs).into_iter().chain(blocks(runs)).collect();
+    Section { id: "inputs", title: "Changes of inputs", blocks }
+}
+
 /// Returns the charts and the table of the responses.
-pub fn blocks(runs: &[RunView<'_>]) -> Vec<Block> {
+fn blocks(runs: &[RunView<'_>]) -> Vec<Block> {
     let lists: Vec<&[StepResponse]> = runs.iter().map(|run| run.source.responses()).collect();
     let groups = groups(&lists);
     let figures: Vec<(Picture, String)> = groups.iter().take(CHARTS).filter_map(|group| figure(group, runs)).collect();
@@ -94,7 +100,8 @@ fn table(groups: &[Group<'_>], runs: &[RunView<'_>]) -> Vec<Block> {
     let figures =
         ["at, s", "rise time, s", "overshoot, %", "settling time, s", "steady-state error", "peak of the command"];
     let head = ["input", "step"].into_iter().chain(several.then_some("run")).chain(figures);
-    let table = Block::table("Responses to steps", head.collect(), rows.into_iter().take(ROWS).collect());
+    let caption = "Responses to steps; the steady-state error has the unit of the response";
+    let table = Block::table(caption, head.collect(), rows.into_iter().take(ROWS).collect());
     shortened(table, count, "responses")
 }
 

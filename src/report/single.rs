@@ -32,7 +32,7 @@ pub fn model(source: &Source, shown: &[String]) -> Result<Model, ReportError> {
         let full = source.scenario.as_ref().map_or(Ok(None), counterpart)?;
         sections.extend(pictures::sections(source, traces, full.as_ref(), &frames, shown)?);
     }
-    sections.push(inputs::section(&[RunView { name: "", source, traces: traces.as_ref() }]));
+    sections.push(responses::section(&[RunView { name: "", source, traces: traces.as_ref() }]));
     let latencies = percentiles::pictures(&source.curves);
     if !latencies.is_empty() {
         sections.push(latency_section(latencies, tables::latencies(source)));

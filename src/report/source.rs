@@ -119,7 +119,7 @@ impl Source {
         self.summary.as_ref().map_or_else(of_scenario, |summary| summary.inputs.clone())
     }
 
-    /// Returns the responses to steps of inputs; without a summary there are none.
+    /// Returns the responses to steps of inputs; empty without a summary.
     pub fn responses(&self) -> &[StepResponse] {
         self.summary.as_ref().map_or(&[], |summary| &summary.score.responses)
     }
