@@ -408,8 +408,15 @@ impl<R: Rig> Scoring<R> {
         self.responses.end();
         let before = self.changes.values_at(&self.infos, tick.saturating_sub(1));
         let now = self.changes.values_at(&self.infos, tick);
-        for change in changes.iter().filter(|change| matches!(change.shape, Shape::Step | Shape::Pulse { .. })) {
+        for change in changes {
             let Some(info) = self.infos.get(change.input) else { continue };
+            // After a pulse only a disturbance has a set point to return to.
+            let disturbs = info.response.is_some_and(|field| field.disturbs);
+            match change.shape {
+                Shape::Step => {}
+                Shape::Pulse { .. } if disturbs => {}
+                _ => continue,
+            }
             let set_point = set_point_of(&self.infos, info).map_or(&[][..], |number| &now[number]);
             self.responses.begin(info, tick, (&before[change.input], &now[change.input]), set_point);
         }
