@@ -6,7 +6,7 @@ use super::hunt_report::{CoreLateness, HuntOptions, HuntReport, Measured};
 use super::probe::{LateWake, Probe, Schedule, Wakes};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::Realtime;
-use crate::late::{Cause, Delay, LateKind, LateTick, TraceRing, causes_by_counters};
+use crate::late::{Cause, Delay, LateKind, LateTick, Steal, TraceRing, causes_by_counters};
 use crate::runtime::{RoleId, hold_low_latency_idle, usable_cores};
 use crate::system::name_thread;
 use crate::telemetry::{Grant, LateRecord};
@@ -45,6 +45,7 @@ pub fn hunt(options: &HuntOptions, ended: &AtomicBool, progress: &mut dyn FnMut(
         Err(error) => (None, Some(error.to_string())),
     };
     let late_ns = realtime.late_ns(options.period_ns());
+    let steal = Steal::read();
     let mut hunter = Hunter { ring, period_ns: options.period_ns(), epoch_ns: 0, cores: Vec::new(), ticks: Vec::new() };
     let start = Start::default();
     let probes: Vec<(Wakes, Vec<Grant>)> = scope(|threads| {
@@ -63,7 +64,9 @@ pub fn hunt(options: &HuntOptions, ended: &AtomicBool, progress: &mut dyn FnMut(
     }
     let cost = hunter.ring.as_ref().map(TraceRing::cost);
     let Hunter { epoch_ns, ticks, .. } = hunter;
-    Ok(HuntReport::new(options, Measured { epoch_ns, late_ns, cores, grants, ticks, cost, note }))
+    let mut report = HuntReport::new(options, Measured { epoch_ns, late_ns, cores, grants, ticks, cost, note });
+    report.late.steal_ms = Steal::read().since_ms(&steal);
+    Ok(report)
 }
 
 /// The common start of all probes, so that none waits for one that does not come.

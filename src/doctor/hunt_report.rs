@@ -5,6 +5,7 @@ use crate::late::{ASCII_US, LateReport, LateTick, SCHEMA as LATE_SCHEMA, Source,
 use crate::late::{header, late_table, pattern, us};
 use crate::telemetry::{Grant, MachineInfo, Percentiles};
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::fmt;
 
 /// Layout version of the report.
@@ -112,6 +113,7 @@ impl HuntReport {
             ticks,
             causes: Vec::new(),
             patterns: Vec::new(),
+            steal_ms: BTreeMap::new(),
             tracer: cost,
         };
         late.summarize();

@@ -8,7 +8,7 @@ use crate::runtime::RoleId;
 use crate::scenario::Scenario;
 use crate::telemetry::RoleReport;
 use corotate_trace::periods;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 /// The least part of a delay that is reported as a cause, and the least unexplained part.
 const LEAST_PART: f64 = 0.02;
@@ -65,6 +65,7 @@ pub fn report(
         ticks,
         causes: Vec::new(),
         patterns: Vec::new(),
+        steal_ms: BTreeMap::new(),
         tracer: cost,
     };
     report.summarize();

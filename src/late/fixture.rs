@@ -52,6 +52,7 @@ pub fn report() -> LateReport {
         examined: ticks.iter().map(|late| late.ticks).sum(),
         causes: totals(&ticks),
         ticks,
+        steal_ms: [(1, 70.0)].into(),
         patterns: vec![Pattern {
             cause: "core taken by the hypervisor".to_owned(),
             compared: 73,

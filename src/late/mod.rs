@@ -11,6 +11,7 @@
 //! | `last` | the last late tick of a running loop |
 //! | `tracer` | the process that records the kernel's trace beside a run |
 //! | `assemble` | the report of a run, with chains of roles and totals by cause |
+//! | `steal` | time that the hypervisor took from the cores |
 //! | `words` | late ticks in words |
 //! | `perfetto` | late ticks and samples as a Chrome trace |
 
@@ -23,6 +24,7 @@ mod last;
 mod model;
 mod perfetto;
 mod ring;
+mod steal;
 mod tracer;
 mod words;
 
@@ -38,6 +40,7 @@ pub use model::{
 };
 pub use perfetto::{Perfetto, SampleMark};
 pub use ring::{TraceRing, remove_dead_traces};
+pub use steal::Steal;
 pub use tracer::run_tracer;
 pub use words::late_table;
 pub(crate) use words::{ASCII_US, cause_rows, header, listing, pattern, sentence, us};

@@ -5,7 +5,7 @@
 use crate::config::RunId;
 use corotate_trace::{Cause, CauseKind};
 use serde::{Deserialize, Serialize};
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 
 /// Layout version of `late.json`.
 pub const SCHEMA: &str = "corotate/late/v1";
@@ -54,6 +54,9 @@ pub struct LateReport {
     pub causes: Vec<CauseTotal>,
     /// Periods with which late ticks repeat.
     pub patterns: Vec<Pattern>,
+    /// Per core the time for which the hypervisor had it although it was needed, by the kernel's counters, ms; 0 is left out.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub steal_ms: BTreeMap<usize, f64>,
     /// The costs of the tracing process, if one ran.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tracer: Option<TracerCost>,

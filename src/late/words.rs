@@ -70,7 +70,9 @@ pub fn header(report: &LateReport, unit: &str) -> String {
         0 => String::new(),
         left_out => format!(" ({left_out} short ones left out of this file)"),
     };
-    format!("{number} late ticks examined{part}; limit {} {unit}; causes from {source}", plain(report.late_us))
+    let steal = |(core, ms): (&usize, &f64)| format!("; the hypervisor took {} ms of core {core}", plain(*ms));
+    let steal: String = report.steal_ms.iter().map(steal).collect();
+    format!("{number} late ticks examined{part}; limit {} {unit}; causes from {source}{steal}", plain(report.late_us))
 }
 
 /// Returns late ticks with their chains of causes, one cause per line.

@@ -6,7 +6,7 @@ use super::LaunchError;
 use super::companion::Companion;
 use super::janitor::Janitor;
 use crate::bus::domain::Domain;
-use crate::late::{Findings, LateReport, TRACER, findings, ready_path, report, trace_refusal, wants_trace};
+use crate::late::{Findings, LateReport, Steal, TRACER, findings, ready_path, report, trace_refusal, wants_trace};
 use crate::scenario::Scenario;
 use crate::telemetry::RoleReport;
 use std::process::Command;
@@ -16,6 +16,8 @@ pub(super) struct TracerWatch {
     pub companion: Companion,
     /// The reason for which the run is not traced.
     note: Option<String>,
+    /// The time that the hypervisor had taken before the run.
+    steal: Steal,
 }
 
 impl TracerWatch {
@@ -25,13 +27,13 @@ impl TracerWatch {
         let arguments = (wants_trace(scenario) && note.is_none()).then_some(|command: &mut Command| {
             command.arg(TRACER).arg("--domain").arg(domain.root());
         });
-        Ok(Self { companion: Companion::start(TRACER, arguments)?, note })
+        Ok(Self { companion: Companion::start(TRACER, arguments)?, note, steal: Steal::read() })
     }
 
     /// Returns the companion of a run that another host traces, or none does.
     #[cfg(feature = "hosts")]
     pub fn none() -> Result<Self, LaunchError> {
-        Ok(Self { companion: Companion::start(TRACER, None::<fn(&mut Command)>)?, note: None })
+        Ok(Self { companion: Companion::start(TRACER, None::<fn(&mut Command)>)?, note: None, steal: Steal::default() })
     }
 
     /// Returns true once the process records, or cannot.
@@ -52,6 +54,7 @@ impl TracerWatch {
         let lost = || self.companion.is_started().then(|| "the tracing process left no report".to_owned());
         let note = self.note.or_else(|| if found.is_none() { lost() } else { None });
         drop(self.companion);
-        report(scenario, reports, found, note)
+        let steal_ms = Steal::read().since_ms(&self.steal);
+        report(scenario, reports, found, note).map(|report| LateReport { steal_ms, ..report })
     }
 }
