@@ -10,7 +10,7 @@ use super::scenario::{Change, changed, load, stem};
 use super::shipped::name;
 use super::signals::catch_signals;
 use crate::config::{ClockKind, RunId};
-use crate::doctor::Machine;
+use crate::doctor::{self, Demand, Machine};
 use crate::files;
 use crate::hosts::{Address, HostEndpoint};
 use crate::late::LateReport;
@@ -338,6 +338,7 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
     screen.print_verbose(format_args!("results go to {}", directory.display()));
     if scenario.clock == ClockKind::Realtime && screen.level > Verbosity::Quiet {
         warn_ungranted(scenario);
+        warn_unfit(scenario);
     }
     let outcome = crate::launch::run(
         scenario,
@@ -377,6 +378,16 @@ fn warn_ungranted(scenario: &Scenario) {
     {
         let (priority, remedy) = (scenario.realtime.priority, priority_remedy(Path::new("/")));
         remark(&Failure::new("not-granted", format!("not granted: SCHED_FIFO {priority}: {error}; {remedy}")));
+    }
+}
+
+/// Prints in one line what about the machine causes late ticks. The privileges have a line of their own.
+fn warn_unfit(scenario: &Scenario) {
+    let checks = Machine::at(Path::new("/")).examine(&Demand::new(scenario)).into_iter();
+    let bad = checks.filter(|check| check.verdict == doctor::Verdict::Bad && !check.name.ends_with(" limit"));
+    let bad: Vec<String> = bad.map(|check| format!("{} ({})", check.name, check.found)).collect();
+    if scenario.realtime.priority > 0 && !bad.is_empty() {
+        remark(&format!("ticks may be late on this machine: {}; `corotate doctor` has the remedies", bad.join(", ")));
     }
 }
 
