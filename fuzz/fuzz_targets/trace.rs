@@ -67,7 +67,7 @@ fn blame(events: Vec<Event>, input: &Input) {
     let to_ns = events.iter().map(|event| event.ns).max().unwrap_or(0).min(from_ns.saturating_add(1 << 40));
     let window = Window::new(events, from_ns, to_ns);
     let at = |fraction: u8| from_ns + (to_ns - from_ns) / 255 * u64::from(fraction);
-    let mut end = 0;
+    let mut end = 0_u8;
     let mut phases = Vec::new();
     for (length, duty) in &input.phases {
         let (begin, next) = (end, end.saturating_add(*length));
