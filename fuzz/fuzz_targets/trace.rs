@@ -34,7 +34,8 @@ fn recorded() -> &'static Recorded {
     static RECORDED: OnceLock<Recorded> = OnceLock::new();
     RECORDED.get_or_init(|| {
         let root = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../crates/trace/tests-data"));
-        let kernels = ["6.18", "5.4"].map(|kernel| Formats::read(&root.join(kernel)).expect("recorded formats are valid"));
+        let kernels =
+            ["6.18", "5.4"].map(|kernel| Formats::read(&root.join(kernel)).expect("recorded formats are valid"));
         Recorded { kernels, pages: std::fs::read(root.join("pages-6.18.bin")).expect("the recorded pages exist") }
     })
 }
