@@ -122,13 +122,13 @@ impl Campaign {
     ) -> Result<Self, ConfigError> {
         // The scenario's part is checked with the scenario.
         let (inner, set) = (file.take(SCENARIO), file.take("set"));
-        let mut faults = file.split_off(&["fault"]);
+        let mut lists = file.split_off(&["fault", "input"]);
         let raw: Raw = file.read_into()?;
         let mut document = match inner {
             Some(inner) => inner,
             None => base(&raw.base, &file, shipped)?,
         };
-        document.append("fault", &mut faults);
+        ["fault", "input"].into_iter().for_each(|key| document.append(key, &mut lists));
         if let Some(set) = set {
             merge(&mut document, &set)?;
         }

@@ -358,6 +358,26 @@ fn impossible_changes_are_refused_with_their_reason() {
     assert_eq!(none.code, Some(2), "{none:?}");
 }
 
+/// A campaign varies a change, and finds the largest disturbance that the loop endures.
+#[test]
+fn a_campaign_varies_inputs_and_finds_a_margin_over_them() {
+    let bench = Bench::new();
+    let campaign = "name = \"push\"\nbase = \"rigid-pair\"\n\
+        [set]\nduration_s = 4\naccept = { steady_state_error_max = 1e-2, unscored_ticks_max = 0 }\n\
+        [[input]]\nat_s = 2.0\nkey = \"follower.0.disturbance_rad_s2\"\nvalue = [0.01, 0.0, 0.0]\n\
+        [[axis]]\nkey = \"controller.gain_per_s\"\nvalues = [4.0, 8.0]\n\
+        [[margin]]\nfind = \"largest\"\nkey = \"input.0.value.0\"\nsuch_that = \"accepted\"\nfrom = 0.001\nto = 1.0\ntolerance = 1e-3\n";
+    std::fs::write(bench.path("push.toml"), campaign).unwrap();
+    let found = bench.run(&["sweep", "./push.toml", "--out", "push", "--json"]).succeeded().json();
+    let points = found["margins"][0]["points"].as_array().unwrap();
+    // The disturbance over the gain is the error that stays.
+    for (point, gain) in points.iter().zip([4.0, 8.0]) {
+        let largest = point["value"].as_f64().unwrap();
+        assert!((largest - 1e-2 * gain).abs() < 2e-3, "{gain}: {point}");
+    }
+    assert_eq!(points.len(), 2, "{found}");
+}
+
 #[test]
 fn tuned_values_are_saved_in_the_scenario_file_with_its_comments() {
     let bench = Bench::new();
