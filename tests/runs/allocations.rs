@@ -4,6 +4,7 @@
 use corotate::bus::domain::OwnedDomain;
 use corotate::bus::iox::IoxBus;
 use corotate::bus::{Bus, BusError, Carried, Read, Reader, Signal, Topic, Write};
+use corotate::input::Change;
 use corotate::rig::Rig;
 use corotate::runtime::{
     DeviceConfig, DeviceLink, Privileges, RoleId, RoleImpl, build_rig, depths, private_ledger, topic,
@@ -241,6 +242,10 @@ fn counts(text: &str, in_device: &[RoleId], processes: &str) -> Vec<(RoleReport,
     let overrides = ["clock=realtime", tick, duration, "accept={}", "fault=[]", "watchdog={}", &processes];
     let overrides = overrides.map(str::to_owned);
     let scenario = Scenario::parse(text, "test", &overrides).unwrap();
+    // The run receives each change of the scenario once more, a little later.
+    let again = |change: &Change| Change { tick: change.tick + 50, ..*change };
+    let again: Vec<Change> = scenario.inputs.scripted.iter().map(again).collect();
+    assert!(again.is_empty() || scenario.inputs.received().append(&again, || true));
     let domain = OwnedDomain::create(0).unwrap();
     // All roles of a device are in the process of the last.
     let elsewhere = &in_device[..in_device.len().saturating_sub(1)];
@@ -291,6 +296,22 @@ fn no_role_allocates_between_its_first_tick_and_its_last() {
     for (name, text) in corotate::config::SHIPPED {
         assert_no_allocation(name, counts(text, &[], "[]"));
     }
+}
+
+#[test]
+fn changes_of_inputs_do_not_allocate() {
+    let (name, text) = corotate::config::SHIPPED[0];
+    let input = |at_s: f64, key: &str, value: &str, shape: &str| {
+        format!("\n[[input]]\nat_s = {at_s}\nkey = \"{key}\"\nvalue = {value}\n{shape}\n")
+    };
+    let ramp = "shape = \"ramp\"\nduration_s = 0.1";
+    let sine = "shape = \"sine\"\nduration_s = 0.3\nfrequency_hz = 20.0";
+    let changes = input(0.3, "controller.gain_per_s", "[5.0, 5.0, 5.0]", ramp)
+        + &input(0.4, "observer.decay_rate_per_s", "7.0", "")
+        + &input(0.5, "follower.0.offset_rad_s", "[0.1, 0.0, 0.0]", "")
+        + &input(0.55, "follower.0.disturbance_rad_s2", "[0.0, 0.1, 0.0]", sine)
+        + &input(0.6, "actuator.safe", "true", "shape = \"pulse\"\nduration_s = 0.01");
+    assert_no_allocation(name, counts(&(text.to_owned() + &changes), &[], "[]"));
 }
 
 #[test]
