@@ -84,7 +84,7 @@ impl<'a, R: Rig> Run<'a, R> {
             estimate: Estimate::<R>::default(),
             estimate_hash: hash(),
             estimate_guard: rig.estimate_guard(),
-            scoring: Scoring::new(rig, scenario),
+            scoring: Scoring::new(rig, scenario, false),
         }
     }
 

@@ -284,7 +284,8 @@ pub(crate) struct Scoring<R: Rig> {
 }
 
 impl<R: Rig> Scoring<R> {
-    pub fn new(rig: &R, scenario: &Settings) -> Self {
+    /// Begins the score of a run; without `follows_inputs` no input changes during it.
+    pub fn new(rig: &R, scenario: &Settings, follows_inputs: bool) -> Self {
         let bodies = rig.bodies().iter();
         // The certificate covers single bodies only.
         let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven && body.fleet.is_none());
@@ -307,7 +308,7 @@ impl<R: Rig> Scoring<R> {
         };
         Self {
             rig: rig.clone(),
-            inputs: RoleInputs::new(&scenario.inputs, |_| true),
+            inputs: RoleInputs::new(&scenario.inputs, |_| follows_inputs),
             infos: scenario.inputs.infos.clone(),
             changes: scenario.inputs.lists(),
             responses: Responses::new(scenario.tick_s()),
@@ -476,7 +477,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
             truths: rig.bodies().iter().map(truth).collect::<Result<_, _>>()?,
             estimate,
             last_tick: scenario.last_tick,
-            scoring: Scoring::new(rig, scenario),
+            scoring: Scoring::new(rig, scenario, true),
         })
     }
 
