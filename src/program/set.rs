@@ -3,9 +3,10 @@
 use super::output::{CommandResult, Exit, Failure, fail, harmless, remark, say};
 use super::runs;
 use crate::config::{Document, Variability};
+use crate::files;
 use crate::inputs::{Answer, InputError, WantedChange, change, current};
 use crate::scenario::Scenario;
-use crate::seat::{scenario_of, write_whole};
+use crate::seat::scenario_of;
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -81,13 +82,13 @@ pub fn set(arguments: &SetArguments) -> CommandResult {
     let changes = assignments.iter().map(|word| wanted(word, arguments.ramp)).collect::<Result<Vec<_>, _>>();
     let changes = changes.map_err(|failure| fail(Exit::Usage, failure))?;
     if changes.is_empty() {
-        return save(&root, arguments);
+        return save(&root, arguments, changes);
     }
     let answer = change(&root, changes.clone(), arguments.at, arguments.force);
     let answer = answer.map_err(|error| fail(exit_of(&error), failure(&error)))?;
-    save(&root, arguments)?;
     if arguments.json {
-        return say(&format!("{}\n", serde_json::to_string(&answer).expect("plain values are JSON")));
+        say(&format!("{}\n", serde_json::to_string(&answer).expect("plain values are JSON")))?;
+        return save(&root, arguments, changes);
     }
     let Answer::Accepted { tick, time_s, delay_ms } = answer else {
         return Err(fail(Exit::Failure, Failure::new("malformed", "the launcher's answer has no tick")));
@@ -97,13 +98,15 @@ pub fn set(arguments: &SetArguments) -> CommandResult {
     for WantedChange { key, value, .. } in &changes {
         writeln!(text, "{key} = {value} from tick {tick} ({time_s:.3} s){delay}").expect("writing to a string works");
     }
-    say(&harmless(&text))
+    say(&harmless(&text))?;
+    save(&root, arguments, changes)
 }
 
-/// Writes the present values of a run to the scenario file of `--save`, where they differ.
-fn save(root: &Path, arguments: &SetArguments) -> CommandResult {
+/// Writes the present values of a run, and those of changes that may act later, to the scenario file of `--save`, where they differ.
+fn save(root: &Path, arguments: &SetArguments, changes: Vec<WantedChange>) -> CommandResult {
     let Some(path) = &arguments.save else { return Ok(Exit::Ok) };
-    let (_, values) = current(root).map_err(|error| fail(exit_of(&error), failure(&error)))?;
+    let (_, mut values) = current(root).map_err(|error| fail(exit_of(&error), failure(&error)))?;
+    values.extend(changes.into_iter().map(|change| (change.key, change.value)));
     match saved(path, &values) {
         Ok(keys) => {
             let names = if keys.is_empty() { "nothing differs".to_owned() } else { keys.join(", ") };
@@ -122,6 +125,12 @@ fn saved(path: &Path, values: &BTreeMap<String, Value>) -> Result<Vec<String>, F
     let text = std::fs::read_to_string(path).map_err(|error| refuse(&error))?;
     let scenario = Scenario::load(path, &[])?;
     let mut document: DocumentMut = text.parse().map_err(|error| refuse(&error))?;
+    // As the file would have them: a typed list may have integers.
+    let written = |(key, value): (&String, &Value)| {
+        let (_, info) = scenario.inputs.find(key).ok()?;
+        Some((info.key.clone(), info.to_toml(&info.from_toml(value).ok()?)))
+    };
+    let values: BTreeMap<String, Value> = values.iter().filter_map(written).collect();
     let differs = |(key, value): &(&String, &Value)| {
         scenario.inputs.find(key).is_ok_and(|(_, info)| info.to_toml(&info.initial) != **value)
     };
@@ -141,7 +150,7 @@ fn saved(path: &Path, values: &BTreeMap<String, Value>) -> Result<Vec<String>, F
         ));
     }
     if !keys.is_empty() {
-        write_whole(path, text.as_bytes()).map_err(|error| refuse(&error))?;
+        files::write(path, text.as_bytes()).map_err(|error| refuse(&error))?;
     }
     Ok(keys)
 }

@@ -27,7 +27,7 @@ pub struct WindowTrace {
     ticks: (u64, u64),
     target: Target,
     own: Option<Place>,
-    /// The same field of body 0, if the response is relative to it.
+    /// The field of body 0 from which the response is measured; `None` if the response is absolute.
     leader: Option<Place>,
     applied: Option<Place>,
 }

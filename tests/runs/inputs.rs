@@ -411,6 +411,11 @@ fn tuned_values_are_saved_in_the_scenario_file_with_its_comments() {
     assert_eq!(comments(&saved), comments(&text) + 2);
     assert!(saved.starts_with("# first") && saved.trim_end().ends_with("# last"));
     bench.run(&["check", "pair.toml"]).succeeded();
+    // A change that acts later is saved with its new value.
+    let later = ["set", "out", "observer.decay_rate_per_s=9", "--ramp", "3600", "--save", "pair.toml"];
+    bench.run(&later).succeeded();
+    let table: toml::Table = std::fs::read_to_string(&file).unwrap().parse().unwrap();
+    assert_eq!(table["observer"]["decay_rate_per_s"], toml::Value::Float(9.0));
     assert_eq!(bench.run(&["set", "out", "--save", "absent.toml"]).code, Some(2));
     running.signal(15);
     running.wait();

@@ -395,17 +395,18 @@ impl<R: Rig> Scoring<R> {
     #[cold]
     fn apply_inputs(&mut self, tick: u64) {
         let rig = &mut self.rig;
-        self.inputs.advance(tick, |new| {
+        let begins = self.inputs.advance(tick, |new| {
             if new.by.user == InputUser::Score {
                 rig.set_input(new.by.port, new.values);
             }
         });
         // V jumps with a set point.
         self.driven.iter_mut().for_each(|driven| driven.before = None);
-        let changes = self.changes.at(tick);
-        if changes.is_empty() {
+        // Within a ramp or an excitation there is nothing to look up.
+        if !begins {
             return;
         }
+        let changes = self.changes.at(tick);
         self.responses.end();
         let before = self.changes.values_at(&self.infos, tick.saturating_sub(1));
         let now = self.changes.values_at(&self.infos, tick);

@@ -103,12 +103,15 @@ impl RoleInputs {
         }
     }
 
-    /// Passes the values that change at a tick to `set`, and the state of every switch that is set at it.
+    /// Passes the values that change at a tick to `set`, and the state of every switch that is set at it. Returns true if a change
+    /// begins to act.
     #[cold]
-    pub fn advance(&mut self, tick: u64, mut set: impl FnMut(NewValue<'_>)) {
+    pub fn advance(&mut self, tick: u64, mut set: impl FnMut(NewValue<'_>)) -> bool {
+        let before = self.entered;
         self.enter_until(tick);
         self.apply(tick, &mut |_, value| set(value));
         self.next = tick + 1;
+        self.entered != before
     }
 
     /// Enters all changes up to a tick, the scripted ones of a tick first.
