@@ -36,6 +36,8 @@ pub use corotate_runtime::{
     with_shipped_rig,
 };
 use corotate_runtime::{direct, failure, panics};
+// Its functions give the same bits on every machine.
+pub use libm;
 pub use nalgebra;
 
 /// A file at the root of these sources.
@@ -50,6 +52,7 @@ pub mod hosts;
 pub mod inputs;
 pub mod late;
 pub mod launch;
+pub mod prelude;
 mod program;
 pub mod record;
 pub mod report;

@@ -72,7 +72,7 @@ impl<R: Rig> Ours<R> {
     pub fn new(rig: &R, scenario: &Scenario) -> Self {
         Self {
             observer: Observer::new(rig.estimator(), scenario.tick_s()),
-            controller: driven(rig).map(|index| Controller::new(rig.law(index))),
+            controller: driven(rig).map(|index| Controller::new(rig.law(index), scenario.tick_s())),
         }
     }
 

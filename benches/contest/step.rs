@@ -257,7 +257,7 @@ fn by_ekf(scenario: &Scenario) -> Option<Contestant<'_>> {
     let begun = move || Ekf::new(&coefficients, 3, [DEVIATION, DENSITY], &first, [0.0, 1.0]);
     let law = driven(rig)?;
     let pass = move || {
-        let (mut filter, mut controller) = (begun(), Controller::new(rig.law(law)));
+        let (mut filter, mut controller) = (begun(), Controller::new(rig.law(law), scenario.tick_s()));
         let (mut estimate, mut command) = (RateEstimate::default(), Default::default());
         let step: fn(&mut Ekf, &mut Controller<_>, f64, &[RateMeasurement; 2], &mut _, &mut _) = black_box(ekf_step);
         timed(|| {

@@ -29,6 +29,10 @@ pub struct AppliedChange {
 pub fn applied(scenario: &Settings) -> Vec<AppliedChange> {
     let inputs = &scenario.inputs;
     let described = |(change, received): (Change, bool)| {
+        // The rows of a table are in the scenario.
+        if matches!(change.shape, Shape::Row { .. }) {
+            return None;
+        }
         let info = inputs.infos.get(change.input)?;
         (change.tick <= scenario.last_tick).then(|| AppliedChange {
             tick: change.tick,
@@ -46,7 +50,7 @@ pub fn applied(scenario: &Settings) -> Vec<AppliedChange> {
 fn name(shape: &Shape) -> &'static str {
     match shape {
         Shape::Step => "step",
-        Shape::Ramp { .. } => "ramp",
+        Shape::Ramp { .. } | Shape::Row { .. } => "ramp",
         Shape::Pulse { .. } => "pulse",
         Shape::Sine { .. } => "sine",
         Shape::Chirp { .. } => "chirp",

@@ -208,7 +208,7 @@ fn role(user: InputUser) -> Option<RoleId> {
     match user {
         InputUser::Body(index) | InputUser::Actuator(index) => Some(RoleId::Plant(index)),
         InputUser::Observer => Some(RoleId::Observer),
-        InputUser::Law(_) => Some(RoleId::Controller),
+        InputUser::Law(_) | InputUser::Reference => Some(RoleId::Controller),
         InputUser::Score => None,
     }
 }

@@ -1,18 +1,38 @@
-//! `corotate new`: creates a crate, a copy of `examples/motor-pair` under another name.
+//! `corotate new`: creates a crate, a copy of a template under another name.
 
 use super::output::{CommandResult, Exit, Failure, fail, say};
 use crate::files::{create_directories, write};
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// The files of the example, without its manifest: a package cannot contain the manifest of another package.
-const FILES: [(&str, &str); 3] = [
-    ("src/main.rs", include_str!("new/main.rs")),
-    ("NAME.toml", include_str!("new/scenario.toml")),
-    ("tests/clocks.rs", include_str!("new/clocks.rs")),
-];
-/// Name of the example.
-const EXAMPLE: &str = "motor-pair";
+/// A crate to begin with, without its manifest: a package cannot contain the manifest of another package.
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum Template {
+    /// Two DC motors, a leader and a follower
+    MotorPair,
+    /// One plant with state feedback, observer and reference
+    CartPole,
+    /// The least that a rig needs
+    Empty,
+}
+
+impl Template {
+    /// Returns the template's own name, its sources, and its scenario.
+    fn parts(self) -> (&'static str, &'static str, &'static str) {
+        match self {
+            Self::MotorPair => {
+                ("motor-pair", include_str!("new/motor-pair/main.rs"), include_str!("new/motor-pair/scenario.toml"))
+            }
+            Self::CartPole => {
+                ("cart-pole", include_str!("new/cart-pole/main.rs"), include_str!("new/cart-pole/scenario.toml"))
+            }
+            Self::Empty => ("empty", include_str!("new/empty/main.rs"), include_str!("new/empty/scenario.toml")),
+        }
+    }
+}
+
+/// The test of every template, and the name of the crate that it tests.
+const TEST: (&str, &str) = (include_str!("new/clocks.rs"), "motor-pair");
 /// Refused names: this crate's own, and names that Cargo refuses.
 const TAKEN: [&str; 4] = ["corotate", "test", "core", "std"];
 
@@ -22,6 +42,9 @@ const TAKEN: [&str; 4] = ["corotate", "test", "core", "std"];
 pub struct Arguments {
     /// Name of the crate, its rig and its scenario: 2 to 32 of a-z, 0-9 and -
     name: String,
+    /// The crate to begin with
+    #[arg(long, value_enum, default_value = "motor-pair")]
+    template: Template,
     /// Directory of the crate [default: ./NAME]
     #[arg(long, value_name = "DIR")]
     path: Option<PathBuf>,
@@ -35,7 +58,7 @@ const SCHEMA: &str = "corotate/new/v1";
 
 const EXAMPLES: &str = "\
 Example:
-  corotate new thermostat && cd thermostat && cargo test
+  corotate new thermostat --template cart-pole && cd thermostat && cargo test
                                    create a crate with a rig that works, then
                                    change the rig (docs/your-own-rig.md)";
 
@@ -55,7 +78,7 @@ pub fn new(arguments: &Arguments) -> CommandResult {
         let reason = format!("{path} exists and is not empty; name another directory with --path");
         return Err(fail(Exit::Usage, Failure::new("not-empty", reason)));
     }
-    match write_all(&directory, name) {
+    match write_all(&directory, name, arguments.template) {
         Ok(()) => say(&created_text(&directory, arguments.json)),
         Err(error) => {
             let reason = format!("cannot write {}: {error}; name another directory with --path", directory.display());
@@ -72,11 +95,17 @@ fn created_text(directory: &Path, json: bool) -> String {
     format!("created the crate {path}; next:\n  cd {path}\n  cargo test\n  cargo run --release\n")
 }
 
-fn write_all(directory: &Path, name: &str) -> io::Result<()> {
-    for (file, text) in FILES {
-        let path = directory.join(file.replace("NAME", name));
+fn write_all(directory: &Path, name: &str, template: Template) -> io::Result<()> {
+    let (example, sources, scenario) = template.parts();
+    let files = [
+        ("src/main.rs".to_owned(), sources, example),
+        (format!("{name}.toml"), scenario, example),
+        ("tests/clocks.rs".to_owned(), TEST.0, TEST.1),
+    ];
+    for (file, text, own_name) in files {
+        let path = directory.join(file);
         path.parent().map_or(Ok(()), create_directories)?;
-        write(&path, text.replace(EXAMPLE, name).as_bytes())?;
+        write(&path, text.replace(own_name, name).as_bytes())?;
     }
     write(&directory.join("Cargo.toml"), manifest(name).as_bytes())?;
     write(&directory.join(".gitignore"), b"/target\n/runs\n")

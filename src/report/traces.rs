@@ -289,7 +289,7 @@ impl Tracer {
         };
         let view = if complete { &mut self.views.complete } else { &mut self.views.incomplete };
         view.advance(tick);
-        view.words().score_words(&words, &mut self.metrics);
+        view.words().score_words(&words, view.reference(), &mut self.metrics);
         self.traces.windows.iter_mut().for_each(|window| window.take(tick, |body| words(body, Signal::Truth)));
         let settled = tick as f64 * self.tick_s >= self.settled_by_s;
         for (metric, &value) in self.traces.metrics.iter_mut().zip(&self.metrics).filter(|(_, value)| !value.is_nan()) {

@@ -347,7 +347,7 @@ impl Feed {
         let mut values = vec![f64::NAN; model.series.len()];
         let metrics = values.len() - usize::from(model.series.last().is_some_and(|series| series.name == LYAPUNOV));
         self.view.advance(tick);
-        self.view.words().score_words(&words, &mut values[..metrics]);
+        self.view.words().score_words(&words, self.view.reference(), &mut values[..metrics]);
         model.series.iter_mut().zip(values).for_each(|(series, value)| series.push(value));
         let commands = (0..bodies.len()).filter_map(|body| words(body, Signal::Command));
         let functions = commands.filter_map(|command| self.rig.lyapunov_words(command));

@@ -241,14 +241,14 @@ fn run(scenario: &Scenario) -> Trace {
             Input::open(&bus, &topic(scenario, &bodies[0].name, Signal::Estimate), Reader::Scorer).unwrap();
         let numbers: Vec<_> = Truth::<R>::FIELDS
             .iter()
-            .filter(|field| field.kind == FieldKind::F64 && R::CONTROLLED.contains(&field.name))
+            .filter(|field| field.kind == FieldKind::F64 && R::controlled().contains(&field.name))
             .collect();
         let (mut errors, mut motion) = (Vec::new(), Vec::new());
         let each = |_: u64| {
             truths.iter_mut().for_each(|truth| assert!(truth.advance().unwrap()));
             estimate.advance().unwrap();
             let mut values = vec![0.0; rig.metrics().len()];
-            rig.score(|index| truths[index].sample(), |_| None, estimate.sample(), &mut values);
+            rig.score(|index| truths[index].sample(), |_| None, estimate.sample(), &[], &mut values);
             errors.push(values);
             let words = corotate::sample::Message::words(truths[0].sample().unwrap());
             let components = |field: &&corotate::sample::Field| words[field.offset / 8..][..field.count].to_vec();

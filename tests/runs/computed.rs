@@ -6,7 +6,7 @@ use bytemuck::{bytes_of, from_bytes};
 use corotate::config::SHIPPED;
 use corotate::launch::{Launch, LaunchError, Outcome, Steps, Summary, run};
 use corotate::rig::{Command, Estimate, Measurement, Rig, RigidBodyRig};
-use corotate::role::Law;
+use corotate::role::Controller;
 use corotate::runtime::{RoleFunction, TickSamples};
 use corotate::sample::Message;
 use corotate::scenario::Scenario;
@@ -27,23 +27,23 @@ fn hash(scenario: &Scenario, outcome: &Outcome) -> String {
 }
 
 /// The rig's own laws, called from outside the library.
-struct Laws(Vec<<R as Rig>::Law>);
+struct Laws(Vec<Controller<<R as Rig>::Law>>);
 
 impl Laws {
     fn new(scenario: &Scenario) -> Self {
         let rig = scenario.rig.downcast_ref::<R>().unwrap();
-        Self((1..rig.bodies().len()).map(|index| rig.law(index)).collect())
+        Self((1..rig.bodies().len()).map(|index| Controller::new(rig.law(index), scenario.tick_s())).collect())
     }
 
     /// Computes the content of each command.
     fn commands(&mut self, inputs: &[Option<&[u64]>]) -> Vec<Vec<u64>> {
         let estimate: &Estimate<R> = from_bytes(bytemuck::cast_slice(inputs[0].unwrap()));
-        let command = |(law, input): (&mut <R as Rig>::Law, &Option<&[u64]>)| {
+        let command = |(controller, input): (&mut Controller<<R as Rig>::Law>, &Option<&[u64]>)| {
             let mut command = Command::<R>::default();
             // In real time a measurement may be missing.
             if let Some(words) = input {
                 let measurement: &Measurement<R> = from_bytes(bytemuck::cast_slice(words));
-                law.command(estimate, measurement, &mut command);
+                controller.step(estimate, measurement, &mut command);
             }
             assert_eq!(bytes_of(&command).len(), 8 * command.words().len());
             command.words()[4..].to_vec()

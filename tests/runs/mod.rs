@@ -12,6 +12,7 @@ mod hil;
 mod hosts;
 mod inputs;
 mod late;
+mod one_plant;
 mod one_process;
 mod own_rig;
 mod processes;

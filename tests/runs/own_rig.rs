@@ -9,20 +9,22 @@ use std::sync::OnceLock;
 
 const TICKS: u64 = 10_001;
 
-/// Builds the program as its author would, but in the same target directory, which has its dependencies.
 fn program() -> &'static Path {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
-    PROGRAM.get_or_init(|| {
-        let profile = Path::new(env!("CARGO_BIN_EXE_corotate")).parent().unwrap();
-        let manifest = root().join("examples/motor-pair/Cargo.toml");
-        let mut command = Command::new(env!("CARGO"));
-        command.args(["build", "--locked", "--manifest-path", manifest.to_str().unwrap()]);
-        command.args(["--target-dir", profile.parent().unwrap().to_str().unwrap()]);
-        command.args((!cfg!(debug_assertions)).then_some("--release"));
-        let built = command.output().unwrap();
-        assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
-        profile.join("motor-pair")
-    })
+    PROGRAM.get_or_init(|| example("motor-pair"))
+}
+
+/// Builds an example as its author would, but in the same target directory, which has its dependencies.
+pub fn example(name: &str) -> PathBuf {
+    let profile = Path::new(env!("CARGO_BIN_EXE_corotate")).parent().unwrap();
+    let manifest = root().join("examples").join(name).join("Cargo.toml");
+    let mut command = Command::new(env!("CARGO"));
+    command.args(["build", "--locked", "--manifest-path", manifest.to_str().unwrap()]);
+    command.args(["--target-dir", profile.parent().unwrap().to_str().unwrap()]);
+    command.args((!cfg!(debug_assertions)).then_some("--release"));
+    let built = command.output().unwrap();
+    assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
+    profile.join(name)
 }
 
 /// Returns the printed hashes, and the number of ticks before the first missed one.
@@ -191,16 +193,23 @@ fn bench_measures_the_own_scenario_without_targets() {
 }
 
 #[test]
-fn corotate_new_writes_this_example_under_another_name() {
+fn corotate_new_writes_an_example_under_another_name() {
     let bench = Bench::new();
-    bench.run(&["new", "two-motors"]).succeeded();
-    for (file, original) in
-        [("src/main.rs", "src/main.rs"), ("two-motors.toml", "motor-pair.toml"), ("tests/clocks.rs", "tests/clocks.rs")]
+    for (name, original, options) in
+        [("two-motors", "motor-pair", &[][..]), ("broom", "cart-pole", &["--template", "cart-pole"])]
     {
-        let written = std::fs::read_to_string(bench.path("two-motors").join(file)).unwrap();
-        let example = std::fs::read_to_string(root().join("examples/motor-pair").join(original)).unwrap();
-        assert_eq!(written, example.replace("motor-pair", "two-motors"), "{file}");
+        bench.run(&[&["new", name], options].concat()).succeeded();
+        for (file, written) in
+            [("src/main.rs", "src/main.rs"), ("ORIGINAL.toml", "NAME.toml"), ("tests/clocks.rs", "tests/clocks.rs")]
+        {
+            let written = std::fs::read_to_string(bench.path(name).join(written.replace("NAME", name))).unwrap();
+            let file = root().join("examples").join(original).join(file.replace("ORIGINAL", original));
+            assert_eq!(written, std::fs::read_to_string(&file).unwrap().replace(original, name), "{file:?}");
+        }
     }
+    bench.run(&["new", "nothing", "--template", "empty"]).succeeded();
+    assert!(std::fs::read_to_string(bench.path("nothing/src/main.rs")).unwrap().contains("\"../nothing.toml\""));
+    assert_eq!(bench.run(&["new", "other", "--template", "other"]).code, Some(2));
     let manifest = std::fs::read_to_string(bench.path("two-motors/Cargo.toml")).unwrap();
     assert!(manifest.contains("name = \"two-motors\"") && manifest.contains("corotate = {"), "{manifest}");
     assert_eq!(bench.run(&["new", "two-motors"]).code, Some(2), "it exists already");

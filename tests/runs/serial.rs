@@ -198,7 +198,7 @@ fn any_role<R: Rig>(rig: &R, role: &str, path: &Path, on: &AtomicBool) {
             path,
             &mut Device::new("any", |hello| {
                 check_role(hello);
-                Some(DeviceController::new([rig.law(1)]))
+                Some(DeviceController::new([rig.law(1)], hello))
             }),
             on,
         ),

@@ -36,6 +36,11 @@ pub enum Shape {
         /// The length, ticks.
         ticks: u64,
     },
+    /// The same as a ramp, to the next row of a table.
+    Row {
+        /// The length, ticks.
+        ticks: u64,
+    },
     /// The amplitude, constant.
     Pulse {
         /// The length, ticks.
@@ -71,7 +76,7 @@ pub enum Shape {
 impl Shape {
     /// Returns true if it sets the level, false if it adds to the level for a while.
     pub fn sets_level(&self) -> bool {
-        matches!(self, Self::Step | Self::Ramp { .. })
+        matches!(self, Self::Step | Self::Ramp { .. } | Self::Row { .. })
     }
 
     /// Returns the length, ticks; 0 for a step.
@@ -79,6 +84,7 @@ impl Shape {
         match *self {
             Self::Step => 0,
             Self::Ramp { ticks }
+            | Self::Row { ticks }
             | Self::Pulse { ticks }
             | Self::Sine { ticks, .. }
             | Self::Chirp { ticks, .. }
@@ -91,7 +97,7 @@ impl Shape {
         let n = elapsed as f64;
         match *self {
             Self::Step | Self::Pulse { .. } => 1.0,
-            Self::Ramp { ticks } => n / ticks as f64,
+            Self::Ramp { ticks } | Self::Row { ticks } => n / ticks as f64,
             Self::Sine { frequency, .. } => libm::sin(TAU * (frequency * n)),
             Self::Chirp { ticks, frequency, end_frequency } => {
                 let slope = (end_frequency - frequency) / ticks as f64;
@@ -112,6 +118,7 @@ impl Shape {
             Self::Sine { ticks, frequency } => [3, ticks, frequency.to_bits(), 0],
             Self::Chirp { ticks, frequency, end_frequency } => [4, ticks, frequency.to_bits(), end_frequency.to_bits()],
             Self::Prbs { ticks, hold_ticks, seed } => [5, ticks, hold_ticks, seed],
+            Self::Row { ticks } => [6, ticks, 0, 0],
         }
     }
 
@@ -124,6 +131,7 @@ impl Shape {
             3 => Self::Sine { ticks, frequency },
             4 => Self::Chirp { ticks, frequency, end_frequency: f64::from_bits(second) },
             5 => Self::Prbs { ticks, hold_ticks: first, seed: second },
+            6 => Self::Row { ticks },
             _ => return None,
         })
     }

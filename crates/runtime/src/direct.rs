@@ -67,7 +67,7 @@ impl<'a, R: Rig> Run<'a, R> {
             false => StateHash::without_checkpoints(),
         };
         let body = |(index, info): (usize, &BodyInfo)| {
-            loop_body(rig, index, info.driven, scenario.actuation(info.driven), scenario.tick_s())
+            loop_body(rig, index, info.driven, scenario.actuation(info.driven), scenario)
         };
         let judge = |index| Judge {
             measurement_guard: rig.measurement_guard(index, true),

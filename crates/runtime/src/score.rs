@@ -15,7 +15,7 @@ use crate::config::{Accept, ChangeLists, InputInfo, InputUser, Settings, set_poi
 use crate::input::Shape;
 use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth, field_named};
 use crate::role::Guard;
-use crate::runtime::{AcceptedTicks, Input, LateSamples, RoleInputs, Seek, topic};
+use crate::runtime::{AcceptedTicks, Input, LateSamples, NewValue, RoleInputs, Seek, topic};
 use crate::sample::{Message, Sample, Stamp, status};
 use response::Responses;
 use serde::{Deserialize, Serialize};
@@ -124,6 +124,18 @@ pub trait Scorer {
     /// # Errors
     /// [`BusError::Receive`].
     fn finish(&mut self) -> Result<Score, BusError>;
+}
+
+/// Passes a new value of an input to the score of a rig, or to its reference.
+fn take_input<R: Rig>(rig: &mut R, reference: &mut [f64], new: NewValue<'_>) {
+    match new.by.user {
+        InputUser::Score => rig.set_input(new.by.port, new.values),
+        InputUser::Reference => {
+            let numbers = reference.iter_mut().skip(new.by.port);
+            numbers.zip(new.values).for_each(|(number, value)| *number = *value);
+        }
+        _ => {}
+    }
 }
 
 /// Opens the scorer of a rig.
@@ -265,6 +277,7 @@ struct RigScorer<R: Rig, B: Bus> {
 /// The score as it grows tick by tick, independent of how the samples arrive.
 pub(crate) struct Scoring<R: Rig> {
     rig: R,
+    reference: Vec<f64>,
     inputs: RoleInputs,
     infos: Vec<InputInfo>,
     changes: ChangeLists,
@@ -308,6 +321,7 @@ impl<R: Rig> Scoring<R> {
         };
         Self {
             rig: rig.clone(),
+            reference: scenario.reference.clone(),
             inputs: RoleInputs::new(&scenario.inputs, |_| follows_inputs),
             infos: scenario.inputs.infos.clone(),
             changes: scenario.inputs.lists(),
@@ -354,7 +368,7 @@ impl<R: Rig> Scoring<R> {
             self.apply_inputs(tick);
         }
         *(if complete { &mut self.score.scored_ticks } else { &mut self.score.unscored_ticks }) += 1;
-        self.rig.score(truth, fleet, estimate, &mut self.values);
+        self.rig.score(truth, fleet, estimate, &self.reference, &mut self.values);
         if self.responses.are_observed() {
             self.responses.take(|body, field, element| number(truth(body)?, field, element));
         }
@@ -394,12 +408,8 @@ impl<R: Rig> Scoring<R> {
 
     #[cold]
     fn apply_inputs(&mut self, tick: u64) {
-        let rig = &mut self.rig;
-        let begins = self.inputs.advance(tick, |new| {
-            if new.by.user == InputUser::Score {
-                rig.set_input(new.by.port, new.values);
-            }
-        });
+        let (rig, reference) = (&mut self.rig, &mut self.reference);
+        let begins = self.inputs.advance(tick, |new| take_input(rig, reference, new));
         // V jumps with a set point.
         self.driven.iter_mut().for_each(|driven| driven.before = None);
         // Within a ramp or an excitation there is nothing to look up.
@@ -408,6 +418,9 @@ impl<R: Rig> Scoring<R> {
         }
         let changes = self.changes.at(tick);
         self.responses.end();
+        if changes.iter().all(|change| matches!(change.shape, Shape::Row { .. })) {
+            return;
+        }
         let before = self.changes.values_at(&self.infos, tick.saturating_sub(1));
         let now = self.changes.values_at(&self.infos, tick);
         for change in changes {

@@ -1,9 +1,8 @@
 //! Two DC motors: the follower tracks the leader's speed, although the leader's load torque is not measured.
 
-use corotate::config::{Checks, InputInfo, InputUser, Variability};
-use corotate::rig::{Context, Difference, SimpleRig};
-use corotate::role::{Body, InvariantRelation, Law, RelationObserver};
-use corotate::{Program, nalgebra::Vector1, observe::Increment, persist_fields, sample};
+use corotate::observe::Increment;
+use corotate::prelude::*;
+use nalgebra::Vector1;
 use serde::{Deserialize, Serialize};
 use std::process::ExitCode;
 
@@ -85,7 +84,8 @@ impl Law for Motor {
     type Estimate = MotorEstimate;
     type Measurement = MotorMeasurement;
     type Command = MotorCommand;
-    fn command(&mut self, leader: &MotorEstimate, own: &MotorMeasurement, out: &mut MotorCommand) {
+    fn command(&mut self, inputs: &LawInputs<'_, Self>, out: &mut MotorCommand) {
+        let (leader, own) = (inputs.estimate, inputs.measurement);
         let rise = leader.rise_rad_s2 - self.gain_per_s * (own.speed_rad_s - leader.speed_rad_s);
         out.current_a = (self.inertia_kg_m2 * rise + self.friction_n_m_s * own.speed_rad_s) / self.torque_n_m_per_a;
     }

@@ -132,7 +132,7 @@ fn run(board: &mut Board) -> Option<()> {
     let body = RigidBody::new(&pair::inertia()?);
     let (mut leader, mut follower) = (Vector3::from(pair::LEADER_RATE_RAD_S), Vector3::from(pair::FOLLOWER_RATE_RAD_S));
     let mut observer = Observer::new(pair::observer()?, TICK_S);
-    let mut controller = Controller::new(pair::law(TICK_S)?);
+    let mut controller = Controller::new(pair::law(TICK_S)?, TICK_S);
     let (mut estimate, mut command) = (RateEstimate::default(), RateCommand::default());
     let (mut observing, mut controlling, mut moving, mut measuring) =
         (Counted::default(), Counted::default(), Counted::default(), Counted::default());

@@ -8,6 +8,6 @@ mod rigid_body;
 
 pub use fleet::flow_all;
 pub use integrate::{flow, rk4_step};
-pub use noise::{Noise, uniform};
+pub use noise::{Noise, quantize, uniform};
 pub use orbit::{CentralField, CentralFieldError, OrbitFault, OrbitState};
 pub use rigid_body::{Inertia, InertiaError, RigidBody, closure, euler};

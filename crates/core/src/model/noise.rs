@@ -91,6 +91,11 @@ pub fn uniform(seed: u64, stream: u64) -> impl FnMut() -> f64 {
     move || noise.uniform()
 }
 
+/// Returns the value that a sensor with this step reports: the nearest multiple of `step`. A step of 0 or less leaves the value.
+pub fn quantize(value: f64, step: f64) -> f64 {
+    if step > 0.0 { step * libm::round(value / step) } else { value }
+}
+
 /// The state is the number of samples drawn.
 impl<const N: usize> Persist for Noise<N> {
     fn persist<W: Words>(&mut self, words: &mut W) {

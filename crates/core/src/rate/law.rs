@@ -2,7 +2,7 @@
 
 use super::port;
 use crate::control::{Certificate, InFlightCommands, InertiaAdaptation, Synchronizer, limited};
-use crate::role::Law;
+use crate::role::{Law, LawInputs};
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement};
 use crate::state::persist_fields;
 use core::hint::black_box;
@@ -85,7 +85,8 @@ impl Law for RateLaw {
     type Command = RateCommand;
 
     #[inline(always)]
-    fn command(&mut self, estimate: &RateEstimate, measurement: &RateMeasurement, out: &mut RateCommand) {
+    fn command(&mut self, inputs: &LawInputs<'_, Self>, out: &mut RateCommand) {
+        let LawInputs { estimate, measurement, .. } = inputs;
         // Read one by one, not as pairs: this core may just have stored them one by one, and a load of two would wait
         // until both have left the store buffer.
         let [x, y, z] = estimate.omega_rad_s;

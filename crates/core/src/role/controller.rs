@@ -1,36 +1,73 @@
-//! The controller: computes a follower's command from the estimate and that follower's measurement of the same tick.
+//! The controller: computes a driven body's command from the reference, the estimate and that body's measurement of the same tick.
 //!
 //! It must not combine samples of different ticks, and must not see the truth.
 
-use crate::sample::{Message, Sample};
+use crate::sample::{Message, Sample, Stamp};
 use crate::state::{Persist, Words};
 
-/// The control law of one rig for one follower.
+/// The most numbers of a loop's reference.
+pub const REFERENCE_MAX: usize = 12;
+
+/// The values from which a law computes the command of a tick.
+#[derive(Debug)]
+pub struct LawInputs<'a, L: Law + ?Sized> {
+    /// The tick of estimate and measurement.
+    pub tick: u64,
+    /// The period h, s.
+    pub period_s: f64,
+    /// The reference at this tick: the numbers of the rig's reference fields, in their order and units. Empty without them.
+    pub reference: &'a [f64],
+    /// The estimate of the observed body's state.
+    pub estimate: &'a L::Estimate,
+    /// The driven body's own measurement.
+    pub measurement: &'a L::Measurement,
+}
+
+impl<L: Law + ?Sized> LawInputs<'_, L> {
+    /// Returns the time since tick 0, s.
+    pub fn time_s(&self) -> f64 {
+        self.tick as f64 * self.period_s
+    }
+}
+
+/// The control law of one rig for one driven body.
 pub trait Law {
-    /// The estimate of the leader's state.
+    /// The estimate of the observed body's state.
     type Estimate: Sample;
-    /// The follower's measurement.
+    /// The driven body's measurement.
     type Measurement: Message + ?Sized;
-    /// The follower's command.
+    /// The driven body's command.
     type Command: Message + ?Sized;
 
     /// Writes the command, but not the stamp.
-    fn command(&mut self, estimate: &Self::Estimate, measurement: &Self::Measurement, out: &mut Self::Command);
-    /// Takes new values of an input of the loop, such as a gain or a reference, from this tick on. `port` is the number that the
+    fn command(&mut self, inputs: &LawInputs<'_, Self>, out: &mut Self::Command);
+    /// Takes new values of an input of the loop, such as a gain or a set point, from this tick on. `port` is the number that the
     /// rig gave to it.
     fn set_input(&mut self, _port: usize, _values: &[f64]) {}
 }
 
-/// A law for one follower that also stamps its commands.
+/// A law for one driven body that also stamps its commands.
 #[derive(Debug)]
 pub struct Controller<L> {
     law: L,
+    period_s: f64,
+    reference: [f64; REFERENCE_MAX],
+    /// The number of numbers of the reference.
+    referred: usize,
 }
 
 impl<L: Law> Controller<L> {
-    /// Creates a controller for one follower.
-    pub fn new(law: L) -> Self {
-        Self { law }
+    /// Creates a controller without a reference. `period_s` is the period h in seconds.
+    pub fn new(law: L, period_s: f64) -> Self {
+        Self { law, period_s, reference: [0.0; REFERENCE_MAX], referred: 0 }
+    }
+
+    /// Adds the reference at tick 0; numbers beyond [`REFERENCE_MAX`] are left out.
+    #[must_use]
+    pub fn with_reference(mut self, reference: &[f64]) -> Self {
+        self.referred = reference.len().min(REFERENCE_MAX);
+        self.set_reference(0, reference);
+        self
     }
 
     /// Passes new values of an input to the law.
@@ -38,16 +75,23 @@ impl<L: Law> Controller<L> {
         self.law.set_input(port, values);
     }
 
+    /// Replaces the numbers of the reference from number `first` on.
+    pub fn set_reference(&mut self, first: usize, values: &[f64]) {
+        let own = self.reference[..self.referred].iter_mut().skip(first);
+        own.zip(values).for_each(|(own, value)| *own = *value);
+    }
+
     /// Computes command k from estimate k and measurement k. The caller sets the stamp's `generation` and `sent_ns`.
     ///
-    /// The command's origin is that of the estimate: the leader's measurement.
+    /// The command's origin is that of the estimate: the observed body's measurement.
     #[inline(always)]
     pub fn step(&mut self, estimate: &L::Estimate, measurement: &L::Measurement, out: &mut L::Command) {
         debug_assert_eq!(estimate.stamp().tick, measurement.stamp().tick);
-        self.law.command(estimate, measurement, out);
+        let Stamp { tick, origin_ns, .. } = *estimate.stamp();
+        let reference = &self.reference[..self.referred];
+        self.law.command(&LawInputs { tick, period_s: self.period_s, reference, estimate, measurement }, out);
         let out = out.stamp_mut();
-        out.tick = estimate.stamp().tick;
-        out.origin_ns = estimate.stamp().origin_ns;
+        (out.tick, out.origin_ns) = (tick, origin_ns);
     }
 }
 

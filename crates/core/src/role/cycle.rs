@@ -22,6 +22,14 @@ impl<B: SingleBody, L: Law<Command = B::Command>, C: AsMut<[B::Command]>> LoopBo
     pub fn new(plant: Plant<B>, control: Option<LoopControl<L, C>>) -> Self {
         Self { plant, measurement: Default::default(), truth: Default::default(), control }
     }
+
+    /// Measures, tells the state and moves for a tick.
+    #[inline]
+    pub fn turn(&mut self, stamp: &Stamp) {
+        self.plant.measure(stamp, &mut self.measurement);
+        self.plant.truth(stamp, &mut self.truth);
+        self.plant.advance(1);
+    }
 }
 
 /// The controller of a body with the commands that do not act yet.
@@ -55,11 +63,24 @@ where
     L: Law<Estimate = E::Estimate, Measurement = B::Measurement, Command = B::Command>,
     C: AsMut<[B::Command]>,
 {
-    for body in &mut *bodies {
-        body.plant.measure(stamp, &mut body.measurement);
-        body.plant.truth(stamp, &mut body.truth);
-        body.plant.advance(1);
-    }
+    bodies.iter_mut().for_each(|body| body.turn(stamp));
+    respond(stamp, observer, estimate, bodies)
+}
+
+/// Runs the part of a tick after the bodies' turns: observer and controllers. Returns false if a command that is due does not act.
+#[inline]
+pub fn respond<B, E, L, C>(
+    stamp: &Stamp,
+    observer: &mut Observer<E>,
+    estimate: &mut E::Estimate,
+    bodies: &mut [LoopBody<B, L, C>],
+) -> bool
+where
+    B: SingleBody,
+    E: Estimator<Measurement = B::Measurement>,
+    L: Law<Estimate = E::Estimate, Measurement = B::Measurement, Command = B::Command>,
+    C: AsMut<[B::Command]>,
+{
     let Some(observed) = bodies.first() else { return true };
     observer.step(&observed.measurement, estimate);
     estimate.stamp_mut().generation = stamp.generation;

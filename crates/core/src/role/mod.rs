@@ -3,6 +3,7 @@
 //! They have no clock, no I/O, no allocation and no logging: their time is the tick in a sample's stamp. The same
 //! state machines run in one thread, in lockstep and in real time, and therefore give the same bits in all three.
 
+mod actuated;
 mod controller;
 mod cycle;
 mod guard;
@@ -10,8 +11,9 @@ mod observer;
 mod plant;
 mod relation;
 
-pub use controller::{Controller, Law};
-pub use cycle::{LoopBody, LoopControl, command_index, cycle};
+pub use actuated::{Actuated, Dynamics};
+pub use controller::{Controller, Law, LawInputs, REFERENCE_MAX};
+pub use cycle::{LoopBody, LoopControl, command_index, cycle, respond};
 pub use guard::{AcceptAll, Bounds, Guard, MotionCheck, PlausibilityCheck, Refusal, SUSPECT_SAMPLES};
 pub use observer::{Estimator, Observer};
 pub use plant::{Actuation, Body, CommandEvent, Plant, Rearm, SingleBody};

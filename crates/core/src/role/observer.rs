@@ -17,9 +17,12 @@ pub trait Estimator {
     fn usable(&self, measurement: &Self::Measurement) -> bool {
         measurement.finite()
     }
-    /// Discards the past and starts at the configured guess, with `measurement` as the first.
-    fn start(&mut self, measurement: &Self::Measurement);
-    /// Updates the estimate with a measurement taken `dt_s` seconds after the last one used. `dt_s` is positive.
+    /// Discards the past and starts at the configured guess, with `measurement` as the first. By default an update over 0 s.
+    fn start(&mut self, measurement: &Self::Measurement) {
+        self.update(measurement, 0.0);
+    }
+    /// Updates the estimate with a measurement taken `dt_s` seconds after the last one used. `dt_s` is positive, or 0
+    /// for the first one by the default [`start`](Self::start).
     fn update(&mut self, measurement: &Self::Measurement, dt_s: f64);
     /// Advances the estimate by the model alone for `dt_s` seconds; without a model the estimate stays. The next
     /// update still spans the time from the last measurement used.

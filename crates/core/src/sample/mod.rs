@@ -4,6 +4,7 @@
 //! versioned type name. Its bytes are the little-endian CDR body of the message with the same fields. A change of
 //! layout changes the version in the name. Samples must not depend on the transport.
 
+mod applied;
 #[cfg(feature = "std")]
 mod definition;
 mod fleet;
@@ -13,6 +14,7 @@ mod order;
 mod rigid;
 mod run;
 
+pub use applied::Applied;
 #[cfg(feature = "std")]
 pub use definition::{CDR_HEADER, Column, Layout, MESSAGE_ENCODING, SCHEMA_ENCODING, frame, topic_of};
 pub use fleet::{
@@ -23,6 +25,8 @@ pub use orbit::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth};
 pub use order::{Order, Place};
 pub use rigid::{RateCommand, RateEstimate, RateMeasurement, RateTruth};
 pub use run::{Health, Phase, RoleState, Schedule};
+
+use crate::state::Words;
 
 /// The header of every sample.
 #[repr(C)]
@@ -184,6 +188,25 @@ pub fn copy_fields<A: Sample, B: Sample>(from: &A, to: &mut B) {
     }
 }
 
+/// Passes the words of a sample through `words`, its numbers as such.
+#[inline]
+pub fn persist<S: Sample, W: Words>(sample: &mut S, words: &mut W) {
+    let own = sample.words_mut();
+    own[..size_of::<Stamp>() / 8].iter_mut().for_each(|word| words.word(word));
+    for field in S::FIELDS {
+        for word in &mut own[field.offset / 8..][..field.count] {
+            match field.kind {
+                FieldKind::U64 => words.word(word),
+                FieldKind::F64 => {
+                    let mut number = f64::from_bits(*word);
+                    words.number(&mut number);
+                    *word = number.to_bits();
+                }
+            }
+        }
+    }
+}
+
 /// Defines a sample: its name, its versioned type name, and its fields of `f64`, `u64` or arrays of them.
 ///
 /// `Pod` rejects padding at compile time. The size is the sum of the fields and a multiple of 8. A field's unit is
@@ -231,7 +254,7 @@ macro_rules! sample {
         impl $crate::state::Persist for $name {
             #[inline]
             fn persist<W: $crate::state::Words>(&mut self, words: &mut W) {
-                $crate::sample::Message::words_mut(self).iter_mut().for_each(|word| words.word(word));
+                $crate::sample::persist(self, words);
             }
         }
 

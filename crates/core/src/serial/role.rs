@@ -230,9 +230,9 @@ pub struct DeviceController<L: Law, const N: usize> {
 }
 
 impl<L: Law<Measurement: Sample, Command: Sample>, const N: usize> DeviceController<L, N> {
-    /// Creates a controller with the law of each body.
-    pub fn new(laws: [L; N]) -> Self {
-        Self { controllers: laws.map(Controller::new) }
+    /// Creates a controller with the law of each body and the period of the greeting. It has no reference.
+    pub fn new(laws: [L; N], hello: &Hello<'_>) -> Self {
+        Self { controllers: laws.map(|law| Controller::new(law, hello.period_ns as f64 / 1e9)) }
     }
 
     /// Computes one command for each body whose measurement is present.
@@ -279,7 +279,7 @@ where
 {
     /// Creates both roles at their initial states, with the period of the greeting.
     pub fn new(estimator: E, laws: [L; N], hello: &Hello<'_>) -> Self {
-        Self { observer: DeviceObserver::new(estimator, hello), controller: DeviceController::new(laws) }
+        Self { observer: DeviceObserver::new(estimator, hello), controller: DeviceController::new(laws, hello) }
     }
 }
 

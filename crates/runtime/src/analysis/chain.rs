@@ -2,18 +2,24 @@
 //!
 //! It gives the bits of an undisturbed run. Must not repeat the computation of a role.
 
-use crate::rig::{Command, Estimate, Rig, RigLoopBody, Truth, loop_body};
-use crate::role::{Actuation, Guard, LoopBody, LoopControl, Observer, Rearm, SUSPECT_SAMPLES, command_index, cycle};
+use crate::config::Settings;
+use crate::rig::{Command, Estimate, Measurement, Rig, RigLoopBody, Truth, loop_body};
+use crate::role::{
+    Actuation, Guard, LoopBody, LoopControl, Observer, Rearm, SUSPECT_SAMPLES, command_index, cycle, respond,
+};
 use crate::sample::{Field, FieldKind, Message, Sample, Stamp};
 use crate::state::{Persist, Words};
 
-/// The loop of a rig's observed body and one driven one, which may be the same.
+/// The loop of a rig's observed body and one driven one, which may be the same, or of all its bodies.
 pub(super) struct Chain<R: Rig> {
     rig: R,
-    /// The observed body, then the driven one if it is another.
+    /// The observed body first.
     bodies: Vec<RigLoopBody<R>>,
+    /// The index of the driven body that is examined.
+    own: usize,
     observer: Observer<R::Estimator>,
     estimate: Estimate<R>,
+    reference: Vec<f64>,
     /// The controlled fields of the truth, and of the estimate.
     controlled: [Vec<&'static Field>; 2],
     /// The next tick.
@@ -22,19 +28,25 @@ pub(super) struct Chain<R: Rig> {
 
 impl<R: Rig> Chain<R> {
     /// Creates the loop, at its start, of a rig whose last body is the driven one.
-    pub fn new(rig: &R, tick_s: f64, delay_ticks: u64) -> Self {
-        let last = rig.bodies().len() - 1;
+    pub fn new(rig: &R, settings: &Settings) -> Self {
+        Self::examine(rig, rig.bodies().len() - 1, settings)
+    }
+
+    /// Creates the loop of all bodies, at its start, in which the body with index `own` is examined.
+    pub fn examine(rig: &R, own: usize, settings: &Settings) -> Self {
         let body = |index: usize| {
             let driven = rig.bodies()[index].driven;
             // No command is ever missing here.
-            let actuation = Actuation { driven, delay_ticks, timeout_ticks: u64::MAX, rearm: Rearm::Auto };
-            loop_body(rig, index, index == last, actuation, tick_s)
+            let actuation = Actuation { timeout_ticks: u64::MAX, rearm: Rearm::Auto, ..settings.actuation(driven) };
+            loop_body(rig, index, driven, actuation, settings)
         };
         Self {
             rig: rig.clone(),
-            bodies: (0..=last).map(body).collect(),
-            observer: Observer::new(rig.estimator(), tick_s),
+            bodies: (0..rig.bodies().len()).map(body).collect(),
+            own,
+            observer: Observer::new(rig.estimator(), settings.tick_s()),
             estimate: Default::default(),
+            reference: settings.reference.clone(),
             controlled: [controlled::<R, Truth<R>>(), controlled::<R, Estimate<R>>()],
             tick: 0,
         }
@@ -47,9 +59,38 @@ impl<R: Rig> Chain<R> {
         self.tick += 1;
     }
 
+    /// Runs one tick in which every number of every measurement is off by `part` of its largest magnitude so far, a little more for
+    /// each. `magnitudes` are those of [`measured`](Self::measured).
+    pub fn advance_disturbed(&mut self, part: f64, magnitudes: &[f64]) {
+        let stamp = Stamp { tick: self.tick, generation: 1, ..Stamp::default() };
+        let mut number = 0;
+        for body in &mut self.bodies {
+            body.turn(&stamp);
+            for field in numbers::<Measurement<R>>().filter(|field| !field.name.starts_with("applied_")) {
+                for bits in &mut body.measurement.words_mut()[field.offset / 8..][..field.count] {
+                    let magnitude = magnitudes.get(number).copied().filter(|size| *size > 0.0).unwrap_or(1.0);
+                    let factor = 1.0 + 0.1 * (number % 7) as f64;
+                    *bits = (f64::from_bits(*bits) + part * factor * magnitude).to_bits();
+                    number += 1;
+                }
+            }
+        }
+        respond(&stamp, &mut self.observer, &mut self.estimate, &mut self.bodies);
+        self.tick += 1;
+    }
+
+    /// Writes the numbers of all measurements at the last tick, without the commands that they tell.
+    pub fn measured(&self, out: &mut Vec<f64>) {
+        out.clear();
+        for body in &self.bodies {
+            let fields = numbers::<Measurement<R>>().filter(|field| !field.name.starts_with("applied_"));
+            fields.for_each(|field| out.extend(values(&body.measurement, field)));
+        }
+    }
+
     /// Returns the driven body with its controller.
     fn driven(&self) -> &RigLoopBody<R> {
-        &self.bodies[self.bodies.len() - 1]
+        &self.bodies[self.own]
     }
 
     /// Returns the newest command.
@@ -60,7 +101,8 @@ impl<R: Rig> Chain<R> {
 
     /// Computes the rig's metrics at the last tick, in the rig's order.
     pub fn score(&self, out: &mut [f64]) {
-        self.rig.score(|index| Some(&self.bodies.get(index)?.truth), |_| None, Some(&self.estimate), out);
+        let truth = |index: usize| Some(&self.bodies.get(index)?.truth);
+        self.rig.score(truth, |_| None, Some(&self.estimate), &self.reference, out);
     }
 
     /// Returns the first body whose motion has ended, with the reason.
@@ -96,8 +138,7 @@ impl<R: Rig> Chain<R> {
 
     /// Passes the state of the loop, without that of the motion to follow.
     fn state<W: Words>(&mut self, visitor: &mut W) {
-        let last = self.bodies.len() - 1;
-        let LoopBody { plant, control, .. } = &mut self.bodies[last];
+        let LoopBody { plant, control, .. } = &mut self.bodies[self.own];
         plant.persist(visitor);
         self.observer.persist(visitor);
         let Some(LoopControl { controller, commands }) = control else { return };
@@ -175,7 +216,8 @@ fn numbers<S: Sample>() -> impl Iterator<Item = &'static Field> {
 }
 
 fn controlled<R: Rig, S: Sample>() -> Vec<&'static Field> {
-    numbers::<S>().filter(|field| R::CONTROLLED.contains(&field.name)).collect()
+    let controlled = R::controlled();
+    numbers::<S>().filter(|field| controlled.contains(&field.name)).collect()
 }
 
 fn values<'a, S: Sample>(sample: &'a S, field: &Field) -> impl Iterator<Item = f64> + use<'a, S> {

@@ -9,6 +9,7 @@
 
 mod chain;
 mod digits;
+mod disturbed;
 mod exponent;
 mod fall;
 mod subject;
@@ -94,7 +95,10 @@ pub(crate) fn of_rig<R: Rig>(rig: &R, scenario: &Settings) -> Vec<Claim> {
 impl<R: Rig> Analysis<'_, R> {
     fn claim(&self, body: &str, certificate: Option<&CertificateReport>) -> Claim {
         let (rate, floors) = match self.rig.isolated(self.index, Start::Settled, false) {
-            None => (Err("this rig does not tell where its loop is settled".to_owned()), Vec::new()),
+            None => match self.settled_floors() {
+                Err(reason) => (Err(reason), Vec::new()),
+                Ok(floors) => (self.judge(&self.exponent_of_disturbance()), floors),
+            },
             Some(settled) => {
                 let exponent = self.exponent(&settled);
                 match self.judge(&exponent) {
@@ -134,11 +138,11 @@ impl<R: Rig> Analysis<'_, R> {
 
     /// Computes when each limit of the scenario is reached, from the error at its start.
     fn reaches(&self, rate_per_s: f64, floors: &[f64]) -> Vec<Reach> {
-        let Some(rig) = self.rig.isolated(self.index, Start::Given, false) else {
-            return Vec::new();
-        };
         let mut start = vec![0.0; floors.len()];
-        let mut chain = Chain::new(&rig, self.tick_s, self.scenario.actuation_delay_ticks);
+        let mut chain = match self.rig.isolated(self.index, Start::Given, false) {
+            Some(rig) => Chain::new(&rig, self.scenario),
+            None => Chain::examine(self.rig, self.index, self.scenario),
+        };
         chain.advance();
         chain.score(&mut start);
         let limits = &self.scenario.accept.metric_max;
@@ -164,7 +168,7 @@ impl<R: Rig> Analysis<'_, R> {
         let mut floors = vec![0.0; self.rig.metrics().len()];
         let mut values = floors.clone();
         if let Some(rig) = self.rig.isolated(self.index, Start::Settled, true) {
-            let mut chain = Chain::new(&rig, self.tick_s, self.scenario.actuation_delay_ticks);
+            let mut chain = Chain::new(&rig, self.scenario);
             let (mut output, mut size) = (Vec::new(), None);
             for tick in 0..ticks {
                 chain.advance();
@@ -187,8 +191,7 @@ impl<R: Rig> Analysis<'_, R> {
         let Some(rig) = self.rig.isolated(self.index, Start::Given, true) else {
             return Ok(());
         };
-        let (mut chain, mut guards) =
-            (Chain::new(&rig, self.tick_s, self.scenario.actuation_delay_ticks), Guards::new(&rig));
+        let (mut chain, mut guards) = (Chain::new(&rig, self.scenario), Guards::new(&rig));
         let (mut values, mut motion) = (vec![0.0; floors.len()], Vec::new());
         // The largest errors: over all ticks, in the second quarter, and in the last.
         let (mut largest, mut halfway, mut last) = (values.clone(), values.clone(), values.clone());

@@ -14,6 +14,16 @@ pub struct BodyInfo {
 }
 
 impl BodyInfo {
+    /// Creates a single body that the controller drives.
+    pub const fn driven(name: &'static str) -> Self {
+        Self { name: Cow::Borrowed(name), driven: true, fleet: None }
+    }
+
+    /// Creates a single body that moves freely.
+    pub const fn free(name: &'static str) -> Self {
+        Self { name: Cow::Borrowed(name), driven: false, fleet: None }
+    }
+
     /// Returns the number of bodies in its signals.
     pub fn bodies(&self) -> usize {
         self.fleet.unwrap_or(1)

@@ -85,6 +85,8 @@ pub enum InputUser {
     Law(usize),
     /// The score of the run.
     Score,
+    /// Every law and the score, as the reference; the port is the number of its first element.
+    Reference,
 }
 
 impl InputInfo {
@@ -237,7 +239,10 @@ impl ChangeLists {
 
     /// Returns the changes that act from a tick on.
     pub fn at(&self, tick: u64) -> Vec<Change> {
-        self.all().into_iter().map(|(change, _)| change).filter(|change| change.tick == tick).collect()
+        let first = self.scripted.partition_point(|change| change.tick < tick);
+        let scripted = self.scripted[first..].iter().take_while(|change| change.tick == tick).copied();
+        let received = (0..self.received.count()).filter_map(|number| self.received.get(number));
+        scripted.chain(received.filter(|change| change.tick == tick)).collect()
     }
 
     /// Returns the values of the inputs at a tick.
@@ -308,7 +313,7 @@ pub(crate) enum RawValue {
 }
 
 impl RawValue {
-    fn to_toml(&self) -> Value {
+    pub fn to_toml(&self) -> Value {
         match self {
             Self::Switch(on) => Value::Boolean(*on),
             Self::Number(number) => Value::Float(*number),
@@ -343,15 +348,30 @@ pub(crate) struct Setting<'a> {
     pub probe: &'a dyn Fn(&str, Value) -> Vec<Mistake>,
 }
 
-/// Checks all changes of a scenario, and returns them in the order of their ticks. Refused ones are recorded and left out.
+/// Checks all `[[input]]` tables and returns their changes. Refused ones are recorded and left out.
 pub(crate) fn resolve(raw: &[RawInput], setting: &Setting<'_>, checks: &mut Checks<'_>) -> Vec<Change> {
     checks.require(raw.len() <= INPUTS_MAX, "input", "too-many", || {
         format!("{} are more than a run takes; give at most {INPUTS_MAX}", raw.len())
     });
-    let each = raw.iter().enumerate().map(|(number, raw)| InputCheck { raw, number, setting, checks }.resolve());
-    let mut changes: Vec<(usize, Change)> = each.flatten().enumerate().collect();
-    changes.sort_by_key(|(number, change)| (change.tick, *number));
-    let changes: Vec<Change> = changes.into_iter().map(|(_, change)| change).collect();
+    let each = raw.iter().enumerate();
+    each.filter_map(|(number, raw)| change_of(raw, format!("input[{number}]"), number, setting, checks)).collect()
+}
+
+/// Checks one change, which stands in the scenario at `place`. `number` seeds its random numbers.
+pub(crate) fn change_of(
+    raw: &RawInput,
+    place: String,
+    number: usize,
+    setting: &Setting<'_>,
+    checks: &mut Checks<'_>,
+) -> Option<Change> {
+    InputCheck { raw, place, number, setting, checks }.resolve()
+}
+
+/// Returns changes in the order of their ticks, and checks that they do not end one another.
+pub(crate) fn in_order(mut changes: Vec<Change>, setting: &Setting<'_>, checks: &mut Checks<'_>) -> Vec<Change> {
+    // Stable: changes of one tick keep their order.
+    changes.sort_by_key(|change| change.tick);
     check_overlaps(&changes, setting, checks);
     changes
 }
@@ -379,6 +399,8 @@ fn check_overlaps(changes: &[Change], setting: &Setting<'_>, checks: &mut Checks
 /// The check of one change.
 struct InputCheck<'a, 'c, 'd> {
     raw: &'a RawInput,
+    /// The key of the table, such as `input[0]`.
+    place: String,
     number: usize,
     setting: &'a Setting<'a>,
     checks: &'c mut Checks<'d>,
@@ -386,7 +408,7 @@ struct InputCheck<'a, 'c, 'd> {
 
 impl InputCheck<'_, '_, '_> {
     fn refuse(&mut self, name: &str, code: &'static str, reason: impl Into<String>) {
-        self.checks.refuse(&format!("input[{}].{name}", self.number), code, reason);
+        self.checks.refuse(&format!("{}.{name}", self.place), code, reason);
     }
 
     fn resolve(mut self) -> Option<Change> {
@@ -409,7 +431,7 @@ impl InputCheck<'_, '_, '_> {
         let shape = self.shape(info)?;
         self.check_values(info, &values, shape);
         if tick > self.setting.last_tick {
-            let key = format!("input[{}].at_s", self.number);
+            let key = format!("{}.at_s", self.place);
             self.checks.warn(&key, format!("{} s is after the last tick: the change does not act", self.raw.at_s));
         }
         Some(Change { tick, input: number, shape, values })

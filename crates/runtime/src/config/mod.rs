@@ -13,6 +13,7 @@ pub(crate) mod hosts;
 pub(crate) mod input;
 pub(crate) mod raw;
 mod reader;
+pub(crate) mod reference;
 mod run_id;
 mod settings;
 mod shape;

@@ -54,6 +54,8 @@ pub struct Settings {
     pub faults: Vec<ScriptedFault>,
     /// The inputs, and their changes.
     pub inputs: Inputs,
+    /// The numbers of the reference at tick 0, in the order of the rig's fields.
+    pub reference: Vec<f64>,
     /// The bounds that the controller watches.
     pub watch: WatchBounds,
     /// The acceptance criteria.

@@ -4,7 +4,7 @@
 
 use super::fleet::Fleet;
 use super::pictures::{Picture, graphs};
-use crate::config::{BodyInfo, Checks, ConfigError, Document, InputInfo};
+use crate::config::{BodyInfo, Checks, ConfigError, Document, InputInfo, Settings};
 use crate::role::{Actuation, Body, Controller, Estimator, Guard, Law, LoopBody, LoopControl, Plant, SingleBody};
 use crate::sample::FleetSample;
 use crate::state::Persist;
@@ -23,12 +23,23 @@ pub type Command<R> = <<R as Rig>::Body as Body>::Command;
 pub type RigLoopBody<R> = LoopBody<<R as Rig>::Body, <R as Rig>::Law, Vec<Command<R>>>;
 
 /// Creates a body of a loop in one thread, at its initial state; `controlled` adds its controller.
-pub fn loop_body<R: Rig>(rig: &R, index: usize, controlled: bool, actuation: Actuation, tick_s: f64) -> RigLoopBody<R> {
+pub fn loop_body<R: Rig>(
+    rig: &R,
+    index: usize,
+    controlled: bool,
+    actuation: Actuation,
+    settings: &Settings,
+) -> RigLoopBody<R> {
     let control = controlled.then(|| LoopControl {
-        controller: Controller::new(rig.law(index)),
+        controller: controller(rig.law(index), settings),
         commands: vec![Command::<R>::default(); actuation.delay_ticks as usize],
     });
-    LoopBody::new(Plant::new(rig.body(index), actuation, tick_s), control)
+    LoopBody::new(Plant::new(rig.body(index), actuation, settings.tick_s()), control)
+}
+
+/// Creates the controller of a law with the scenario's reference at tick 0.
+pub fn controller<L: Law>(law: L, settings: &Settings) -> Controller<L> {
+    Controller::new(law, settings.tick_s()).with_reference(&settings.reference)
 }
 
 /// The full state of a rig's fleet.
@@ -80,12 +91,14 @@ pub trait Rig: Clone + Send + Sync + 'static {
     const LISTS: &'static [&'static str] = &[];
     /// The number of leading components covered by the `valid` word of measurements and estimates.
     const AXES: usize = 0;
-    /// The fields of truths and estimates that the loop controls: their errors must vanish.
-    const CONTROLLED: &'static [&'static str] = &[];
     /// The field of truths that the loop does not control, if there is one, such as an orbit's phase. A motion shifted in this
     /// field is equally good.
     const FREE: Option<&'static str> = None;
 
+    /// Returns the fields of truths and estimates that the loop controls: their errors must vanish.
+    fn controlled() -> Vec<&'static str> {
+        Vec::new()
+    }
     /// Returns the scenario keys that belong to this rig and hold one table, such as `leader`.
     fn tables() -> Vec<&'static str>;
     /// Reads the rig of the given name from its tables. Returns it with the same tables in which every default is filled in. The
@@ -127,13 +140,19 @@ pub trait Rig: Clone + Send + Sync + 'static {
     }
     /// Returns the names of the metrics; the last part of each name is its unit.
     fn metrics(&self) -> Vec<&'static str>;
+    /// Returns the fields of the scenario's `[reference]` with the number of elements of each; at most
+    /// [`REFERENCE_MAX`](crate::role::REFERENCE_MAX) elements in all, and 6 of one field.
+    fn reference() -> Vec<(&'static str, usize)> {
+        Vec::new()
+    }
     /// Writes one tick's value of every metric: NaN if a sample that it needs is missing, +inf once a body is lost. `truth` returns
-    /// the truth of the body with an index, `fleet` that of a fleet.
+    /// the truth of the body with an index, `fleet` that of a fleet. `reference` has the numbers of the reference at that tick.
     fn score<'a>(
         &self,
         truth: impl Fn(usize) -> Option<&'a Truth<Self>>,
         fleet: impl Fn(usize) -> Option<&'a FleetTruth<Self>>,
         estimate: Option<&Estimate<Self>>,
+        reference: &[f64],
         out: &mut [f64],
     );
     /// Returns how a body's motion has ended, as a verb with its object, such as `leaves the region`.
@@ -144,6 +163,12 @@ pub trait Rig: Clone + Send + Sync + 'static {
     /// The loop starts as `start` says, with sensor noise if `noisy`. Returns `None` if the target state is unknown.
     fn isolated(&self, _index: usize, _start: Start, _noisy: bool) -> Option<Self> {
         None
+    }
+    /// Returns the rig without noise and rounding of its sensors, for the analysis of a loop that [`isolated`](Self::isolated) does
+    /// not know.
+    #[must_use]
+    fn ideal(&self) -> Self {
+        self.clone()
     }
     /// Returns the scenario keys that may change while the loop runs.
     fn inputs(&self) -> Vec<InputInfo> {

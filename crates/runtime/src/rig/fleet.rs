@@ -1,6 +1,6 @@
 //! The contract of a fleet: many bodies that one process simulates and one sample describes.
 
-use crate::role::{Body, Guard, Law};
+use crate::role::{Body, Guard, Law, LawInputs};
 use crate::sample::{CommandLayout, FleetLayout, FleetSample, MeasurementLayout, Sample, TruthLayout};
 use crate::state::{Persist, Words};
 use std::marker::PhantomData;
@@ -114,7 +114,7 @@ impl<E: Sample> Law for NoLaw<E> {
     type Measurement = FleetSample<MeasurementLayout>;
     type Command = FleetSample<CommandLayout>;
 
-    fn command(&mut self, _estimate: &E, _measurement: &Self::Measurement, _out: &mut Self::Command) {
+    fn command(&mut self, _inputs: &LawInputs<'_, Self>, _out: &mut Self::Command) {
         match self.0 {}
     }
 }

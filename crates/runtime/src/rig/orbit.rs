@@ -172,8 +172,11 @@ impl Rig for OrbitRig {
     const AXES: usize = 4;
     const NAMES: &'static [&'static str] = &["orbit-hold", "orbit-rendezvous"];
     const LISTS: &'static [&'static str] = &["follower"];
-    const CONTROLLED: &'static [&'static str] = &["radius_du", "velocity_du_s"];
     const FREE: Option<&'static str> = Some("angle_rad");
+
+    fn controlled() -> Vec<&'static str> {
+        vec!["radius_du", "velocity_du_s"]
+    }
 
     fn tables() -> Vec<&'static str> {
         vec!["central_body", "leader", "spacecraft", "observer", "controller", "limits"]
@@ -266,6 +269,7 @@ impl Rig for OrbitRig {
         truth: impl Fn(usize) -> Option<&'a OrbitTruth>,
         _fleet: impl Fn(usize) -> Option<&'a FleetTruth<Self>>,
         estimate: Option<&OrbitEstimate>,
+        _reference: &[f64],
         out: &mut [f64],
     ) {
         let lost = |index| truth(index).is_some_and(|truth| truth.status & status::FAULT != 0);
@@ -417,7 +421,7 @@ fn worse(a: f64, b: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::config::SHIPPED;
-    use crate::role::{Body, Estimator, Guard, Law};
+    use crate::role::{Body, Controller, Estimator, Guard};
     use crate::sample::{OrbitCommand, OrbitMeasurement, Stamp};
     use crate::scenario::Scenario;
 
@@ -438,7 +442,7 @@ mod tests {
             (rig.estimator(), OrbitEstimate::default(), OrbitCommand::default());
         observer.start(&measured(0));
         observer.write(0, &mut estimate);
-        rig.law(index).command(&estimate, &measured(index), &mut command);
+        Controller::new(rig.law(index), 0.01).step(&estimate, &measured(index), &mut command);
         Vector2::from(command.thrust_du_s2).amax()
     }
 
@@ -484,7 +488,7 @@ mod tests {
             body.truth(0, &mut truth);
             observer.write(0, &mut estimate);
             assert!(rig.estimate_guard().accepts(&estimate), "{estimate:?}");
-            rig.score(|_| Some(&truth), |_| None, Some(&estimate), &mut errors);
+            rig.score(|_| Some(&truth), |_| None, Some(&estimate), &[], &mut errors);
             body.flow(rig.tick_s);
         }
         assert!(errors[0] < 1e-6, "an error of {} of 7600 du/s is left", errors[0]);

@@ -4,12 +4,12 @@
 
 use super::{BodyInfo, Context, Estimate, FleetTruth, Measurement, Monitor, NoFleet, Picture, Rig, Truth, graphs};
 use crate::config::{Checks, ConfigError, Document, InputInfo, keys_of};
-use crate::role::{Body, Estimator, Guard, Law, Refusal, SingleBody};
+use crate::input::COMPONENTS_MAX;
+use crate::role::{Body, Estimator, Guard, Law, REFERENCE_MAX, Refusal, SingleBody};
 use crate::sample::{Field, FieldKind, Message, Sample};
 use crate::state::{Persist, Words};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use std::borrow::Cow;
 
 /// A rig with one kind of body: by default a leader, which is observed, and a follower, which is driven.
 ///
@@ -20,7 +20,7 @@ use std::borrow::Cow;
 ///
 /// ```
 /// # extern crate corotate_core as corotate;
-/// use corotate::role::{Body, Estimator, Law};
+/// use corotate::role::{Body, Estimator, Law, LawInputs};
 /// use corotate::{persist_fields, sample};
 /// use corotate_runtime::rig::{Difference, SimpleRig};
 /// use corotate_runtime::scenario::{RigKind, Scenario, register};
@@ -80,8 +80,9 @@ use std::borrow::Cow;
 ///     type Estimate = Estimate;
 ///     type Measurement = Measurement;
 ///     type Command = Command;
-///     fn command(&mut self, leader: &Estimate, own: &Measurement, out: &mut Command) {
-///         out.speed_m_s = self.leader_speed_m_s + self.gain_per_s * (leader.position_m - own.position_m);
+///     fn command(&mut self, inputs: &LawInputs<'_, Self>, out: &mut Command) {
+///         let distance_m = inputs.estimate.position_m - inputs.measurement.position_m;
+///         out.speed_m_s = self.leader_speed_m_s + self.gain_per_s * distance_m;
 ///     }
 /// }
 ///
@@ -141,18 +142,20 @@ pub trait SimpleRig: Serialize + DeserializeOwned + Clone + Send + Sync + 'stati
     const NAME: &'static str;
     /// The fields of the type that a scenario gives as lists of tables.
     const LISTS: &'static [&'static str] = &[];
+    /// The bodies, if they do not depend on the scenario; the first is the observed one. By default a free `leader` and a driven
+    /// `follower`.
+    const BODIES: &'static [BodyInfo] = &[BodyInfo::free("leader"), BodyInfo::driven("follower")];
     /// The metrics of a run.
     const METRICS: &'static [Difference];
+    /// The fields of the truth that follow the scenario's `[reference]`, which has a key for each. The law receives their numbers in
+    /// this order.
+    const REFERENCE: &'static [&'static str] = &[];
 
     /// Checks the parameters and records problems by key, as `cart.gain_per_s`. May store what it needs of `_context`.
     fn check(&mut self, _context: Context, _checks: &mut Checks<'_>) {}
-    /// Returns the bodies; the first is the observed one. By default a free `leader` and a driven `follower`.
+    /// Returns the bodies; the first is the observed one. By default [`BODIES`](Self::BODIES).
     fn bodies(&self) -> &[BodyInfo] {
-        const PAIR: [BodyInfo; 2] = [
-            BodyInfo { name: Cow::Borrowed("leader"), driven: false, fleet: None },
-            BodyInfo { name: Cow::Borrowed("follower"), driven: true, fleet: None },
-        ];
-        &PAIR
+        Self::BODIES
     }
     /// Creates the body with this index at its initial state.
     fn body(&self, index: usize) -> Self::Body;
@@ -169,6 +172,11 @@ pub trait SimpleRig: Serialize + DeserializeOwned + Clone + Send + Sync + 'stati
     fn inputs(&self) -> Vec<InputInfo> {
         Vec::new()
     }
+    /// Returns the rig without noise and rounding of its sensors. The analysis of `check` needs it to see how a small error falls.
+    #[must_use]
+    fn ideal(&self) -> Self {
+        self.clone()
+    }
     /// Returns the quantities that the controller can watch.
     fn monitors() -> &'static [Monitor<Self>] {
         &[]
@@ -179,7 +187,9 @@ pub trait SimpleRig: Serialize + DeserializeOwned + Clone + Send + Sync + 'stati
     }
 }
 
-/// A metric: the length of the difference between a field and the same field of the first body's truth.
+/// A metric: the length of the difference between a field and what it is compared with.
+///
+/// A metric of the driven bodies is that of the worst one. The last part of its name is the unit.
 #[derive(Debug, Clone, Copy)]
 pub struct Difference {
     metric: &'static str,
@@ -189,26 +199,58 @@ pub struct Difference {
 
 #[derive(Debug, Clone, Copy)]
 enum Compared {
+    /// The driven bodies with the first body.
     Driven,
+    /// The estimate with the first body.
     Estimate,
+    /// The driven bodies with the reference.
+    Reference,
+    /// The driven bodies with zero.
+    Zero,
 }
 
 impl Difference {
-    /// Creates a metric of the worst driven body: the distance of its true field from that of the first body. The last part of
-    /// `metric` is the unit.
+    /// Creates a metric of the driven bodies: the distance of their true field from that of the first body.
     pub const fn following(metric: &'static str, field: &'static str) -> Self {
         Self { metric, field, compared: Compared::Driven }
     }
 
-    /// Creates a metric of the estimate: the distance of its field from the truth. The last part of `metric` is the unit.
+    /// Creates a metric of the estimate: the distance of its field from that of the first body's truth.
     pub const fn estimating(metric: &'static str, field: &'static str) -> Self {
         Self { metric, field, compared: Compared::Estimate }
     }
 
-    /// Returns true if the samples have the field. Evaluated at compile time.
-    const fn exists(&self, truth: &[Field], estimate: &[Field]) -> bool {
-        has(truth, self.field) && (matches!(self.compared, Compared::Driven) || has(estimate, self.field))
+    /// Creates a metric of the driven bodies: the distance of their true field from the reference, which must have that field.
+    pub const fn from_reference(metric: &'static str, field: &'static str) -> Self {
+        Self { metric, field, compared: Compared::Reference }
     }
+
+    /// Creates a metric of the driven bodies: the length of their true field.
+    pub const fn from_zero(metric: &'static str, field: &'static str) -> Self {
+        Self { metric, field, compared: Compared::Zero }
+    }
+
+    /// Returns the signal that lacks the metric's field, if there is one. Evaluated at compile time.
+    const fn lacking(&self, truth: &[Field], estimate: &[Field], reference: &[&str]) -> Option<&'static str> {
+        match self.compared {
+            _ if !has(truth, self.field) => Some("truth"),
+            Compared::Estimate if !has(estimate, self.field) => Some("estimate"),
+            Compared::Reference if !lists(reference, self.field) => Some("reference (REFERENCE)"),
+            _ => None,
+        }
+    }
+}
+
+/// Returns true if the list has this name. Usable at compile time.
+const fn lists(names: &[&str], name: &str) -> bool {
+    let mut index = 0;
+    while index < names.len() {
+        if same(names[index].as_bytes(), name.as_bytes()) {
+            return true;
+        }
+        index += 1;
+    }
+    false
 }
 
 /// Returns true if there is a numeric field of this name.
@@ -246,8 +288,12 @@ fn numbers<'a, S: Sample>(sample: &'a S, name: &str) -> &'a [f64] {
     bytemuck::cast_slice(&sample.words()[from..from + count])
 }
 
-fn distance(a: &[f64], b: &[f64]) -> f64 {
-    libm::sqrt(a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum())
+/// Returns the distance of two vectors; NaN if one is missing.
+fn distance(a: Option<&[f64]>, b: Option<&[f64]>) -> f64 {
+    match (a, b) {
+        (Some(a), Some(b)) => libm::sqrt(a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum()),
+        _ => f64::NAN,
+    }
 }
 
 /// A guard that accepts samples whose numbers are finite and within their bounds.
@@ -287,18 +333,82 @@ impl Persist for Bounded {
     fn persist<W: Words>(&mut self, _words: &mut W) {}
 }
 
-/// A compile-time check that a rig's metrics name fields of its samples.
+/// A compile-time check that a rig's metrics and reference name fields of its samples.
 struct Declared<R>(R);
 
 impl<R: SimpleRig> Declared<R> {
     const EXIST: () = {
-        let mut index = 0;
+        let (truth, estimate) = (<Truth<R> as Sample>::FIELDS, <Estimate<R> as Sample>::FIELDS);
+        let (mut index, mut numbers) = (0, 0);
+        while index < R::REFERENCE.len() {
+            let name = R::REFERENCE[index];
+            let Some(place) = field_named(truth, name) else {
+                Sentence::new(&["REFERENCE of the rig ", R::NAME, " names ", name, ", but its truth has no such field"])
+                    .panic()
+            };
+            numbers += truth[place].count;
+            if truth[place].count > COMPONENTS_MAX || numbers > REFERENCE_MAX {
+                Sentence::new(&["REFERENCE of the rig ", R::NAME, " has too many numbers at ", name]).panic()
+            }
+            index += 1;
+        }
+        index = 0;
         while index < R::METRICS.len() {
-            let exists = R::METRICS[index].exists(<Truth<R> as Sample>::FIELDS, <Estimate<R> as Sample>::FIELDS);
-            assert!(exists, "a metric of this rig names a field that its samples do not have");
+            let Difference { metric, field, .. } = R::METRICS[index];
+            if let Some(signal) = R::METRICS[index].lacking(truth, estimate, R::REFERENCE) {
+                Sentence::new(&[
+                    "the metric ",
+                    metric,
+                    " names the field ",
+                    field,
+                    ", but there is no such number in the ",
+                    signal,
+                ])
+                .panic()
+            }
             index += 1;
         }
     };
+
+    /// Returns the numbers of a field of the reference.
+    fn numbers<'a>(reference: &'a [f64], name: &str) -> Option<&'a [f64]> {
+        let count = |name: &&str| {
+            let field = field_named(<Truth<R> as Sample>::FIELDS, name);
+            field.map_or(0, |field| <Truth<R> as Sample>::FIELDS[field].count)
+        };
+        let place = R::REFERENCE.iter().position(|field| *field == name)?;
+        let first: usize = R::REFERENCE[..place].iter().map(count).sum();
+        reference.get(first..first + count(&R::REFERENCE[place]))
+    }
+}
+
+/// A message that is put together at compile time.
+struct Sentence {
+    bytes: [u8; 256],
+    length: usize,
+}
+
+impl Sentence {
+    /// Joins parts; what is too long is cut off.
+    const fn new(parts: &[&str]) -> Self {
+        let (mut bytes, mut length, mut part) = ([0; 256], 0, 0);
+        while part < parts.len() {
+            let (text, mut index) = (parts[part].as_bytes(), 0);
+            while index < text.len() && length < bytes.len() {
+                bytes[length] = text[index];
+                (length, index) = (length + 1, index + 1);
+            }
+            part += 1;
+        }
+        Self { bytes, length }
+    }
+
+    const fn panic(&self) -> ! {
+        match core::str::from_utf8(self.bytes.split_at(self.length).0) {
+            Ok(text) => panic!("{}", text),
+            Err(_) => panic!("a metric of this rig names a field that its samples do not have"),
+        }
+    }
 }
 
 impl<R: SimpleRig> Rig for R {
@@ -311,6 +421,14 @@ impl<R: SimpleRig> Rig for R {
     type Fleet = NoFleet;
     const NAMES: &'static [&'static str] = &[R::NAME];
     const LISTS: &'static [&'static str] = R::LISTS;
+
+    fn controlled() -> Vec<&'static str> {
+        R::METRICS.iter().map(|difference| difference.field).collect()
+    }
+
+    fn ideal(&self) -> Self {
+        SimpleRig::ideal(self)
+    }
 
     fn tables() -> Vec<&'static str> {
         keys_of::<R>().iter().copied().filter(|field| !R::LISTS.contains(field)).collect()
@@ -376,26 +494,37 @@ impl<R: SimpleRig> Rig for R {
         R::METRICS.iter().map(|difference| difference.metric).collect()
     }
 
+    fn reference() -> Vec<(&'static str, usize)> {
+        let () = Declared::<R>::EXIST;
+        let count = |name: &'static str| {
+            let field = <Truth<R> as Sample>::FIELDS.iter().find(|field| field.name == name);
+            (name, field.map_or(0, |field| field.count))
+        };
+        R::REFERENCE.iter().copied().map(count).collect()
+    }
+
     fn score<'a>(
         &self,
         truth: impl Fn(usize) -> Option<&'a Truth<Self>>,
         _fleet: impl Fn(usize) -> Option<&'a FleetTruth<Self>>,
         estimate: Option<&Estimate<Self>>,
+        reference: &[f64],
         out: &mut [f64],
     ) {
         let () = Declared::<R>::EXIST;
         for (value, Difference { field, compared, .. }) in out.iter_mut().zip(R::METRICS) {
-            let from = |to: Option<&[f64]>| match (to, truth(0)) {
-                (Some(to), Some(first)) => distance(to, numbers(first, field)),
-                _ => f64::NAN,
+            let first = truth(0).map(|first| numbers(first, field));
+            let worst = |error: &dyn Fn(&[f64]) -> f64| {
+                let bodies = SimpleRig::bodies(self).iter().enumerate().filter(|(_, body)| body.driven);
+                let errors =
+                    bodies.map(|(index, _)| truth(index).map_or(f64::NAN, |truth| error(numbers(truth, field))));
+                errors.reduce(|a, b| if a.is_nan() || a > b { a } else { b }).unwrap_or(f64::NAN)
             };
             *value = match compared {
-                Compared::Estimate => from(estimate.map(|estimate| numbers(estimate, field))),
-                Compared::Driven => {
-                    let bodies = SimpleRig::bodies(self).iter().enumerate().filter(|(_, body)| body.driven);
-                    let errors = bodies.map(|(index, _)| from(truth(index).map(|truth| numbers(truth, field))));
-                    errors.reduce(|a, b| if a.is_nan() || a > b { a } else { b }).unwrap_or(f64::NAN)
-                }
+                Compared::Estimate => distance(estimate.map(|estimate| numbers(estimate, field)), first),
+                Compared::Driven => worst(&|own| distance(Some(own), first)),
+                Compared::Reference => worst(&|own| distance(Some(own), Declared::<R>::numbers(reference, field))),
+                Compared::Zero => worst(&|own| libm::sqrt(own.iter().map(|number| number * number).sum())),
             };
         }
     }

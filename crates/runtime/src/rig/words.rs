@@ -24,8 +24,10 @@ pub trait WordView {
     fn guard(&self, body: usize, signal: Signal) -> Option<Box<dyn WordGuard>>;
     /// Returns the number of leading components covered by the `valid` word of measurements and estimates.
     fn axes(&self) -> usize;
+    /// Returns the fields of the reference, as [`Rig::reference`].
+    fn reference(&self) -> Vec<(&'static str, usize)>;
     /// Writes one tick's value of every metric, as [`Rig::score`] does; `words` returns the samples.
-    fn score_words<'a>(&self, words: &dyn Fn(usize, Signal) -> Option<&'a [u64]>, out: &mut [f64]);
+    fn score_words<'a>(&self, words: &dyn Fn(usize, Signal) -> Option<&'a [u64]>, reference: &[f64], out: &mut [f64]);
     /// Returns V and the bound on V̇ that a command carries, as [`Rig::lyapunov`].
     fn lyapunov_words(&self, command: &[u64]) -> Option<(f64, f64)>;
     /// Returns true if the bound on V̇ applies to a driven body, as [`Rig::bound_applies`].
@@ -79,12 +81,16 @@ impl<R: Rig> WordView for R {
         R::AXES
     }
 
-    fn score_words<'a>(&self, words: &dyn Fn(usize, Signal) -> Option<&'a [u64]>, out: &mut [f64]) {
+    fn reference(&self) -> Vec<(&'static str, usize)> {
+        R::reference()
+    }
+
+    fn score_words<'a>(&self, words: &dyn Fn(usize, Signal) -> Option<&'a [u64]>, reference: &[f64], out: &mut [f64]) {
         let bodies = self.bodies();
         let truth = |index: usize| words(index, Signal::Truth);
         let single = |index: usize| truth(index).filter(|_| bodies[index].fleet.is_none()).and_then(cast::<Truth<R>>);
         let fleet = |index: usize| truth(index).filter(|_| bodies[index].fleet.is_some()).map(FleetSample::over);
-        self.score(single, fleet, words(0, Signal::Estimate).and_then(cast::<Estimate<R>>), out);
+        self.score(single, fleet, words(0, Signal::Estimate).and_then(cast::<Estimate<R>>), reference, out);
     }
 
     fn lyapunov_words(&self, command: &[u64]) -> Option<(f64, f64)> {
@@ -142,7 +148,7 @@ mod tests {
             _ => None,
         };
         let (view, mut values) = (scenario.rig, [f64::NAN; 2]);
-        view.score_words(&words, &mut values);
+        view.score_words(&words, &[], &mut values);
         assert_eq!(values, [2.0, 0.5]);
         assert_eq!(view.lyapunov_words(&[0; 3]), None, "too short for a command");
         assert_eq!(view.length(0, Signal::Command), None, "the leader is not driven");

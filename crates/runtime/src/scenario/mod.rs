@@ -24,7 +24,7 @@ use crate::config::hosts::{self, Hosts};
 use crate::config::raw::{Launch, Policy, Raw};
 use crate::config::{
     BodyInfo, Checks, ClockKind, ConfigError, Cores, Document, InputInfo, InputUser, Inputs, NotExternal, Realtime,
-    Settings, Shape, Supervision, Variability, fault, input, nearest, watchdog,
+    Settings, Shape, Supervision, Variability, fault, input, nearest, reference, watchdog,
 };
 use crate::control::{ACTUATION_DELAY_MAX, WatchBounds};
 use crate::rig::Context;
@@ -132,6 +132,7 @@ impl Scenario {
                 return Err(first.and(errors));
             }
         };
+        let mut raw = raw;
         check_common(&raw, &mut checks);
         let period_ns = (1e9 / raw.tick_hz).round() as u64;
         // For a refused tick rate, the rig gets the shortest tick, so that it does not report the same mistake.
@@ -151,7 +152,7 @@ impl Scenario {
         let hosts = Hosts { hosts: raw.host.clone(), network: raw.network.clone() };
         hosts::check_alone(&hosts, &raw.launch.processes, &raw.launch.external, &mut checks);
         let (mut faults, mut watch, mut signals) = (Vec::new(), WatchBounds::NONE, Vec::new());
-        let mut inputs = Inputs::default();
+        let (mut inputs, mut initial_reference) = (Inputs::default(), Vec::new());
         if let Some(rig) = &rig {
             let bodies: Vec<(&str, bool)> = rig.bodies().iter().map(|body| (&*body.name, body.driven)).collect();
             hosts::check(&hosts, &bodies, &rig.roles(), actuation_delay_ticks, &mut checks);
@@ -169,10 +170,17 @@ impl Scenario {
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
             inputs.infos = rig.inputs();
             inputs.infos.extend(safe_switch(&raw, rig.bodies()));
+            let fields = rig.reference();
+            reference::read_files(&mut raw.reference, &fields, &mut checks);
+            let referred = reference::inputs(&raw.reference, &fields, (rig.bodies(), &signals), &mut checks);
+            referred.iter().for_each(|info| initial_reference.extend_from_slice(&info.initial));
+            inputs.infos.extend(referred);
             let probe =
                 |key: &str, value| without_changes.as_ref().map_or_else(Vec::new, |base| mistakes(base, key, value));
             let setting = input::Setting { infos: &inputs.infos, tick_s, last_tick, seed: raw.seed, probe: &probe };
-            inputs.scripted = input::resolve(&raw.input, &setting, &mut checks).into();
+            let mut changes = reference::changes(&raw.reference, &setting, &mut checks);
+            changes.extend(input::resolve(&raw.input, &setting, &mut checks));
+            inputs.scripted = input::in_order(changes, &setting, &mut checks).into();
             watch =
                 watchdog::resolve(&raw.watchdog, &maxima.watchdog, &rig.monitors(), tick_s, duration_s, &mut checks);
         }
@@ -206,6 +214,7 @@ impl Scenario {
             hosts,
             faults,
             inputs,
+            reference: initial_reference,
             watch,
             accept,
             run: document.run(),

@@ -1,6 +1,7 @@
 //! A rig's view of samples as words that follows the inputs of a run, for readers of whole runs.
 
-use crate::config::{InputUser, Settings};
+use super::take_input;
+use crate::config::Settings;
 use crate::rig::{Rig, WordView};
 use crate::runtime::RoleInputs;
 
@@ -10,17 +11,21 @@ pub trait TimedView {
     fn advance(&mut self, tick: u64) -> bool;
     /// Returns the view at the tick of the last [`advance`](Self::advance).
     fn words(&self) -> &dyn WordView;
+    /// Returns the numbers of the reference at that tick.
+    fn reference(&self) -> &[f64];
 }
 
 /// Opens the view of a rig.
 pub(crate) fn timed_view<R: Rig>(rig: &R, scenario: &Settings) -> Box<dyn TimedView> {
-    let first = RigAtTick { rig: rig.clone(), inputs: RoleInputs::new(&scenario.inputs, |_| true), next: 0 };
+    let inputs = RoleInputs::new(&scenario.inputs, |_| true);
+    let first = RigAtTick { rig: rig.clone(), reference: scenario.reference.clone(), inputs, next: 0 };
     Box::new(Timed { now: first.clone(), first })
 }
 
 #[derive(Clone)]
 struct RigAtTick<R> {
     rig: R,
+    reference: Vec<f64>,
     inputs: RoleInputs,
     next: u64,
 }
@@ -36,14 +41,12 @@ impl<R: Rig> TimedView for Timed<R> {
         if tick + 1 < self.now.next {
             self.now = self.first.clone();
         }
-        let RigAtTick { rig, inputs, next } = &mut self.now;
+        let RigAtTick { rig, reference, inputs, next } = &mut self.now;
         let mut changes = false;
         if inputs.is_due(tick) {
             inputs.advance(tick, |new| {
                 changes = true;
-                if new.by.user == InputUser::Score {
-                    rig.set_input(new.by.port, new.values);
-                }
+                take_input(rig, reference, new);
             });
         }
         *next = tick + 1;
@@ -52,6 +55,10 @@ impl<R: Rig> TimedView for Timed<R> {
 
     fn words(&self) -> &dyn WordView {
         &self.now.rig
+    }
+
+    fn reference(&self) -> &[f64] {
+        &self.now.reference
     }
 }
 
@@ -80,7 +87,7 @@ mod tests {
         let mut at = |tick: u64| {
             let changes = view.advance(tick);
             let mut values = [f64::NAN; 2];
-            view.words().score_words(&words, &mut values);
+            view.words().score_words(&words, view.reference(), &mut values);
             (changes, values[0], view.words().bound_applies(1))
         };
         assert_eq!(at(999), (false, 2.0, true));

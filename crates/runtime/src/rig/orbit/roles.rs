@@ -6,7 +6,7 @@ use crate::control::{InFlightCommands, OrbitHold};
 use crate::model::{CentralField, Noise, OrbitState};
 use crate::observe::{Filter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
 use crate::rig::filter::FilterDesign;
-use crate::role::{Body, Estimator, Law};
+use crate::role::{Body, Estimator, Law, LawInputs};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth, status};
 use crate::state::persist_fields;
 use crate::vector::zeros;
@@ -309,7 +309,8 @@ impl Law for OrbitLaw {
     type Command = OrbitCommand;
 
     #[inline]
-    fn command(&mut self, estimate: &OrbitEstimate, measurement: &OrbitMeasurement, out: &mut OrbitCommand) {
+    fn command(&mut self, inputs: &LawInputs<'_, Self>, out: &mut OrbitCommand) {
+        let LawInputs { estimate, measurement, .. } = inputs;
         out.thrust_du_s2 = self.thrust(estimate, measurement).unwrap_or_default().into();
         if let Some(sent) = self.in_flight.sent(measurement.stamp.tick) {
             *sent = out.thrust_du_s2;

@@ -9,7 +9,7 @@ use crate::control::{FleetLaw, InFlightCommands};
 use crate::model::{RigidBody, flow_all, uniform};
 use crate::rate::port;
 use crate::rig::Fleet;
-use crate::role::{Body, Bounds, Guard, Law, MotionCheck, Refusal};
+use crate::role::{Body, Bounds, Guard, Law, LawInputs, MotionCheck, Refusal};
 use crate::sample::{
     CommandLayout, FleetCommand, FleetMeasurement, FleetTruth, MeasurementLayout, Message, RateEstimate, TruthLayout,
 };
@@ -211,7 +211,8 @@ impl Law for FleetRateLaw {
     type Measurement = FleetMeasurement;
     type Command = FleetCommand;
 
-    fn command(&mut self, estimate: &RateEstimate, measurement: &FleetMeasurement, out: &mut FleetCommand) {
+    fn command(&mut self, inputs: &LawInputs<'_, Self>, out: &mut FleetCommand) {
+        let LawInputs { estimate, measurement, .. } = inputs;
         if self.learned {
             self.law.learn(estimate.coefficients.into());
         }

@@ -234,7 +234,10 @@ impl Rig for RigidBodyRig {
     const AXES: usize = 3;
     const NAMES: &'static [&'static str] = &["rigid-body"];
     const LISTS: &'static [&'static str] = &["follower"];
-    const CONTROLLED: &'static [&'static str] = &["omega_rad_s", "coefficients"];
+
+    fn controlled() -> Vec<&'static str> {
+        vec!["omega_rad_s", "coefficients"]
+    }
 
     fn tables() -> Vec<&'static str> {
         vec!["leader", "observer", "controller", "limits"]
@@ -354,6 +357,7 @@ impl Rig for RigidBodyRig {
         truth: impl Fn(usize) -> Option<&'a RateTruth>,
         fleet: impl Fn(usize) -> Option<&'a FleetTruth>,
         estimate: Option<&RateEstimate>,
+        _reference: &[f64],
         out: &mut [f64],
     ) {
         let rate = |index| truth(index).map(|truth| Vector3::from(truth.omega_rad_s));

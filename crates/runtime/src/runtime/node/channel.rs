@@ -5,7 +5,7 @@ use super::missed::MissedTicks;
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
 use crate::config::InputUser;
-use crate::rig::{BodyInfo, Estimate, Fleet, Rig};
+use crate::rig::{BodyInfo, Estimate, Fleet, Rig, controller};
 use crate::role::{Controller, Guard, Law};
 use crate::runtime::error::NodeError;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
@@ -74,7 +74,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         context: &NodeContext<'_, B>,
     ) -> Result<Self, BusError> {
         let measurement = context.input(body, Signal::Measurement, guard)?;
-        let controller = Controller::new(law);
+        let controller = controller(law, context.scenario);
         let missed = MissedTicks::default();
         Ok(Self { body: index, controller, measurement, command, ready: false, began_ns: 0, sent_ns: 0, missed })
     }
@@ -140,8 +140,10 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     }
 
     fn set_input(&mut self, new: NewValue<'_>) {
-        if new.by.user == InputUser::Law(self.body) {
-            self.controller.set_input(new.by.port, new.values);
+        match new.by.user {
+            InputUser::Law(body) if body == self.body => self.controller.set_input(new.by.port, new.values),
+            InputUser::Reference => self.controller.set_reference(new.by.port, new.values),
+            _ => {}
         }
     }
 

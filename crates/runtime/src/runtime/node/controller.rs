@@ -66,7 +66,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             counters: TickCounters::default(),
             watchdog: Watchdog::new(context.scenario.watch),
             interruptions: context.interruptions(),
-            inputs: context.inputs(|user| matches!(user, InputUser::Law(_))),
+            inputs: context.inputs(|user| matches!(user, InputUser::Law(_) | InputUser::Reference)),
             ledger: context.ledger.reopened(),
             source,
             look: 0,

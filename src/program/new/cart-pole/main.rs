@@ -1,0 +1,1 @@
+../../../../examples/cart-pole/src/main.rs

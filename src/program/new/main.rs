@@ -1,1 +1,0 @@
-../../../examples/motor-pair/src/main.rs

@@ -1,0 +1,1 @@
+../../../../examples/motor-pair/src/main.rs
