@@ -150,6 +150,8 @@ pub(crate) fn score_rig<R: Rig, B: Bus + 'static>(
 /// A driven body, for the live certificate.
 struct DrivenBody {
     body: usize,
+    /// True while the bound on V̇ applies at the present inputs.
+    bounded: bool,
     /// The previous tick with its V and its bound on V̇.
     before: Option<(u64, f64, f64)>,
 }
@@ -329,7 +331,9 @@ impl<R: Rig> Scoring<R> {
             accept: scenario.accept.clone(),
             tick_s: scenario.tick_s(),
             delay_ticks: scenario.actuation_delay_ticks,
-            driven: driven.map(|(body, _)| DrivenBody { body, before: None }).collect(),
+            driven: driven
+                .map(|(body, _)| DrivenBody { body, bounded: rig.bound_applies(body), before: None })
+                .collect(),
             statuses: core::iter::once(estimates).chain(truths).collect(),
             services: signals.map(|(body, signal)| topic(scenario, body, signal).to_string()).collect(),
             next_tick: 0,
@@ -372,13 +376,15 @@ impl<R: Rig> Scoring<R> {
         if self.responses.are_observed() {
             self.responses.take(|body, field, element| number(truth(body)?, field, element));
         }
-        self.score.faulted_ticks += u64::from(self.values.contains(&f64::INFINITY));
-        let time_s = tick as f64 * self.tick_s;
-        for (index, metric) in self.score.metrics.iter_mut().enumerate() {
-            let value = self.values[index];
+        let (mut faulted, time_s) = (false, tick as f64 * self.tick_s);
+        for (metric, &value) in self.score.metrics.iter_mut().zip(&self.values) {
+            faulted |= value == f64::INFINITY;
             metric.take(tick, value, &self.accept, time_s);
-            metric.ise += if value.is_nan() { 0.0 } else { value * value * self.tick_s };
+            if !value.is_nan() {
+                metric.ise += value * value * self.tick_s;
+            }
         }
+        self.score.faulted_ticks += u64::from(faulted);
         if !self.incidents.is_empty()
             && !self.within()
             && let Some((_, _, last)) = self.incidents.iter_mut().rfind(|(_, from, _)| *from <= tick)
@@ -394,7 +400,7 @@ impl<R: Rig> Scoring<R> {
         for driven in &mut self.driven {
             let (observed, own) = (truth(0), truth(driven.body));
             let now = match (observed, own, seen) {
-                (Some(observed), Some(own), Some(estimate)) => {
+                (Some(observed), Some(own), Some(estimate)) if driven.bounded => {
                     self.rig.true_lyapunov(driven.body, observed, own, estimate)
                 }
                 _ => None,
@@ -411,7 +417,9 @@ impl<R: Rig> Scoring<R> {
         let (rig, reference) = (&mut self.rig, &mut self.reference);
         let begins = self.inputs.advance(tick, |new| take_input(rig, reference, new));
         // V jumps with a set point.
-        self.driven.iter_mut().for_each(|driven| driven.before = None);
+        for driven in &mut self.driven {
+            (driven.before, driven.bounded) = (None, self.rig.bound_applies(driven.body));
+        }
         // Within a ramp or an excitation there is nothing to look up.
         if !begins {
             return;
@@ -569,7 +577,8 @@ impl MetricScore {
         }
         self.last = value;
         if time_s >= accept.settled_by_s {
-            self.settled_max = Some(self.settled_max.map_or(value, |worst| worst.max(value)));
+            // No value here is NaN, for which `f64::max` would pay.
+            self.settled_max = Some(self.settled_max.map_or(value, |worst| if value > worst { value } else { worst }));
         }
         if time_s >= accept.peak_from_s && self.peak.is_none_or(|peak| value > peak) {
             (self.peak, self.peak_tick) = (Some(value), Some(tick));

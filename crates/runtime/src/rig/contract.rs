@@ -184,8 +184,8 @@ pub trait Rig: Clone + Send + Sync + 'static {
     fn undisturbed(_truth: &Truth<Self>) -> bool {
         true
     }
-    /// Returns V and the bound on V̇ for the driven body with an index, from the truths of the observed and the driven body and from the estimate.
-    /// Returns `None` if the rig has no Lyapunov function.
+    /// Returns V and the bound on V̇ for the driven body with an index, from the truths of the observed and the driven body and from the
+    /// estimate. Called only while [`bound_applies`](Rig::bound_applies). Returns `None` if the rig has no Lyapunov function.
     fn true_lyapunov(
         &self,
         _index: usize,
@@ -195,7 +195,8 @@ pub trait Rig: Clone + Send + Sync + 'static {
     ) -> Option<(f64, f64)> {
         None
     }
-    /// Returns true if the bound on V̇ applies to the driven body with an index at the present inputs, such as disturbances.
+    /// Returns true if the bound on V̇ applies to the driven body with an index at the present inputs, such as disturbances. Called
+    /// again only after a change of an input.
     fn bound_applies(&self, _index: usize) -> bool {
         true
     }

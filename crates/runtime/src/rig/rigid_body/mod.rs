@@ -486,14 +486,11 @@ impl Rig for RigidBodyRig {
     #[inline]
     fn true_lyapunov(
         &self,
-        index: usize,
+        _index: usize,
         leader: &RateTruth,
         follower: &RateTruth,
         estimate: &RateEstimate,
     ) -> Option<(f64, f64)> {
-        if !self.bound_applies(index) {
-            return None;
-        }
         let (rate, own) = (Vector3::from(leader.omega_rad_s), Vector3::from(follower.omega_rad_s));
         let hidden_error = rate[self.supplied()] - estimate.omega_rad_s[self.supplied()];
         Some(self.certificate?.lyapunov(&(own - rate), hidden_error))
