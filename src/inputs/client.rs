@@ -16,7 +16,7 @@ use toml::Value;
 const PATIENCE: Duration = Duration::from_secs(10);
 
 /// The codes of refusals.
-const CODES: [&str; 9] = [
+const CODES: [&str; 10] = [
     "not-tunable",
     "wrong-type",
     "wrong-shape",
@@ -26,6 +26,7 @@ const CODES: [&str; 9] = [
     "after-end",
     "too-many",
     "no-change",
+    "busy",
 ];
 
 /// A change was not made.
