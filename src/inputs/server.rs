@@ -5,7 +5,7 @@
 use super::protocol::{Answer, LINE_MAX, Request, WantedChange};
 use crate::bus::domain::Domain;
 use crate::changes::ReceivedChanges;
-use crate::config::{InputInfo, InputUser, Settings};
+use crate::config::{InputInfo, Settings};
 use crate::input::{Change, Shape};
 use crate::runtime::RoleId;
 use std::io::{self, BufRead, BufReader, Read, Write};
@@ -203,16 +203,6 @@ fn values(scenario: &Settings, tick: u64) -> Answer {
     Answer::Values { tick, values: values.collect() }
 }
 
-/// Returns the role that a user of an input belongs to.
-fn role(user: InputUser) -> Option<RoleId> {
-    match user {
-        InputUser::Body(index) | InputUser::Actuator(index) => Some(RoleId::Plant(index)),
-        InputUser::Observer => Some(RoleId::Observer),
-        InputUser::Law(_) | InputUser::Reference => Some(RoleId::Controller),
-        InputUser::Score => None,
-    }
-}
-
 /// Returns a wanted change, with tick 0.
 ///
 /// # Errors
@@ -230,7 +220,7 @@ pub(crate) fn resolve(
         let (least, largest) = info.range;
         return Err(Answer::refused("out-of-range", format!("{key} is out of range; give {least} to {largest}")));
     }
-    let absent = info.uses.iter().filter_map(|by| role(by.user)).find(|role| is_absent(*role));
+    let absent = info.uses.iter().filter_map(|by| RoleId::using(by.user)).find(|role| is_absent(*role));
     if let Some(absent) = absent {
         let name = absent.name(scenario);
         let reason = format!("{key} is used by {name}, which another program runs: it takes no inputs");

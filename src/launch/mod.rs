@@ -2,6 +2,7 @@
 //!
 //! Never leaves a process or a shared-memory file behind, however it ends. Must not compute what roles compute.
 
+mod change_signal;
 mod children;
 mod companion;
 mod criteria;

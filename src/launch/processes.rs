@@ -5,6 +5,7 @@
 #[cfg(feature = "hosts")]
 mod joined;
 
+use super::change_signal::ChangeSignal;
 use super::children::{END_LIMIT, RoleProcess};
 use super::companion::Companion;
 use super::external::{ExternalWatch, Waiting};
@@ -249,6 +250,7 @@ pub(super) struct Supervisor<'a> {
     members: Vec<Member>,
     externals: ExternalWatch,
     schedule: <IoxBus as Bus>::Writer<Schedule>,
+    changes: ChangeSignal,
     word: Schedule,
     incidents: Incidents,
     recorder: RecorderWatch,
@@ -269,6 +271,7 @@ impl<'a> Supervisor<'a> {
         janitor: &'a mut Janitor,
     ) -> Result<Self, LaunchError> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
+        let changes = ChangeSignal::open(scenario, bus)?;
         let mut recorder = RecorderWatch::start(launch.record.as_deref(), scenario, domain, bus)?;
         let foxglove = foxglove::start(launch.foxglove, domain)?;
         let tracer = TracerWatch::start(scenario, domain)?;
@@ -304,6 +307,7 @@ impl<'a> Supervisor<'a> {
             members,
             externals,
             schedule,
+            changes,
             word,
             incidents,
             recorder,
@@ -499,7 +503,7 @@ impl<'a> Supervisor<'a> {
                 next_look_ns = now_ns + SCORE_NS;
                 self.announce()?;
                 self.listen()?;
-                self.serve_inputs(launch);
+                self.serve_inputs(launch)?;
                 let tick = scorer.next_tick();
                 if !self.supervise(&mut |id, tick| scorer.incident(id, tick), tick, now_ns)? {
                     return Ok(0);
@@ -531,7 +535,7 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Serves requests to change inputs.
-    fn serve_inputs(&mut self, launch: &Launch<'_>) {
+    fn serve_inputs(&mut self, launch: &Launch<'_>) -> Result<(), BusError> {
         let (scenario, word) = (self.scenario, &self.word);
         let period_ns = scenario.period_ns;
         let timing = || match scenario.clock {
@@ -558,6 +562,7 @@ impl<'a> Supervisor<'a> {
         if let Some(inputs) = &mut self.inputs {
             inputs.poll(scenario, &self.received, &timing, &is_absent);
         }
+        self.changes.publish()
     }
 
     /// Restarts roles that have failed, and records hosts that left; returns false if the run must end. `note` receives the number
@@ -632,6 +637,7 @@ impl<'a> Supervisor<'a> {
 
     /// Publishes the schedule again.
     pub fn announce(&mut self) -> Result<(), BusError> {
+        self.changes.publish()?;
         self.word.stamp =
             Stamp { tick: self.word.stamp.tick + 1, generation: 1, origin_ns: 0, sent_ns: monotonic_ns() };
         let word = self.word;

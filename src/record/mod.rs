@@ -15,6 +15,7 @@
 //!
 //! Must not change a sample, nor delay a loop, except by its credit in lockstep.
 
+mod changes;
 mod diff;
 mod export;
 mod process;

@@ -8,6 +8,7 @@
 use super::RecordError;
 use super::recorder::{CHANGES, END, INPUTS, LATE, LATE_REPORT, RUN, SCHEMA, SignalReport, layouts};
 use super::writer::{CHECKSUM, checksum};
+use crate::bus::Signal;
 use crate::config::{RunId, ScriptedFault};
 use crate::files;
 use crate::input::{CHANGE_WORDS, Change};
@@ -189,7 +190,8 @@ impl Recording {
         for signal in &mut signals {
             signal.samples = counts.get(&signal.channel).copied().unwrap_or(0);
         }
-        let last_tick = ticks.into_values().filter(|tick| *tick <= info.last_tick).max();
+        let last_ticks = signals.iter().filter_map(|signal| ticks.get(&signal.channel).copied());
+        let last_tick = last_ticks.filter(|tick| *tick <= info.last_tick).max();
         let late = content.metadata.get_mut(LATE).and_then(|entries| entries.remove(LATE_REPORT));
         let changes = read_changes(&content.metadata);
         Ok(Self { path: path.to_owned(), info, signals, flaw, last_tick, late, changes })
@@ -578,6 +580,10 @@ impl Content {
                     return Err(format!("channel {topic} has the signal of another channel"));
                 }
                 self.sizes.insert(channel.id, layout.size());
+                // For foreign readers: the metadata has the changes of inputs too.
+                if signal == Signal::Input.name() {
+                    return Ok(());
+                }
                 let (service, role) = (about("service"), about("role"));
                 let channel = channel.id;
                 self.signals.push(SignalInfo { service, body, signal, role, layout, samples: 0, channel });

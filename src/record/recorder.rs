@@ -1,6 +1,7 @@
 //! Writes all samples of a run to a file, and compares its counters with those of the roles. Must not judge a sample.
 
 use super::RecordError;
+use super::changes::ChangeTap;
 use super::taps::{SignalCounters, Taps};
 use super::writer::Writer;
 use crate::bus::AnyBus;
@@ -148,6 +149,7 @@ impl RecordingReport {
 /// A recording in progress.
 pub struct Recorder {
     taps: Taps,
+    changes: ChangeTap,
     signals: Vec<SignalReport>,
     writer: Writer,
     file: String,
@@ -167,6 +169,7 @@ impl Recorder {
     pub fn open<'a>(scenario: &Scenario, bus: impl Into<AnyBus<'a>>, path: &Path) -> Result<Self, RecordError> {
         Ok(Self {
             taps: Taps::open(scenario, bus)?,
+            changes: ChangeTap::new(scenario),
             signals: Vec::new(),
             writer: Writer::create(path)?,
             file: path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
@@ -190,12 +193,14 @@ impl Recorder {
     /// [`RecordError::Write`].
     pub fn start(&mut self, epoch_ns: u64, joined: Option<u64>) -> Result<(), RecordError> {
         self.taps.start(epoch_ns, joined);
+        self.changes.start(epoch_ns);
         self.begun = true;
         self.run.insert("whole".to_owned(), joined.is_none().to_string());
         self.run.insert("epoch_ns".to_owned(), epoch_ns.to_string());
         let run = self.run.clone();
         self.taps.announce(&mut self.writer)?;
-        self.writer.metadata(RUN, run)
+        self.writer.metadata(RUN, run)?;
+        self.changes.drain(&mut self.writer)
     }
 
     /// Writes the samples that have arrived, and returns their number.
@@ -219,7 +224,8 @@ impl Recorder {
         let entries = [(CHANGES.to_owned(), json(&new.collect::<Vec<_>>()))].into();
         let name = format!("{INPUTS}{}", self.recorded_changes);
         self.recorded_changes = count;
-        self.writer.metadata(&name, entries)
+        self.writer.metadata(&name, entries)?;
+        self.changes.drain(&mut self.writer)
     }
 
     /// Returns the first tick that some signal still lacks.

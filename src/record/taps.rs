@@ -136,17 +136,23 @@ impl Tap {
 
     fn announce(&mut self, sink: &mut dyn MessageSink) -> Result<(), RecordError> {
         let Port { topic, type_name, fields, .. } = &self.port;
-        let about = [
-            ("service", topic.to_string()),
-            ("type_name", (*type_name).to_owned()),
-            ("role", self.role.clone()),
-            ("body", topic.body.clone()),
-            ("signal", topic.signal.name().to_owned()),
-        ];
-        let about = about.map(|(key, value)| (key.to_owned(), value)).into();
-        self.channel = sink.channel(&topic.to_string(), &Layout::from_fields(type_name, fields), about)?;
+        let layout = Layout::from_fields(type_name, fields);
+        self.channel = sink.channel(&topic.to_string(), &layout, about(&self.port, &self.role))?;
         Ok(())
     }
+}
+
+/// Returns the metadata of the channel of a signal that a role publishes.
+pub(super) fn about(port: &Port, role: &str) -> BTreeMap<String, String> {
+    let Port { topic, type_name, .. } = port;
+    let about = [
+        ("service", topic.to_string()),
+        ("type_name", (*type_name).to_owned()),
+        ("role", role.to_owned()),
+        ("body", topic.body.clone()),
+        ("signal", topic.signal.name().to_owned()),
+    ];
+    about.map(|(key, value)| (key.to_owned(), value)).into()
 }
 
 /// Readers of all signals of a run.

@@ -296,6 +296,7 @@ class Follower:
         void_bit = self.seat["void_bit"]
         (self.command,) = (Reader(self.transport, described, void_bit) for described in self.seat["reads"])
         self.schedule = Reader(self.transport, self.seat["schedule"], void_bit)
+        self.input, self.changes = Reader(self.transport, self.seat["input"], void_bit), []
 
     def run(self):
         """Runs the role until the run ends."""
@@ -432,10 +433,18 @@ class Follower:
         sample.denied = sum(not grant["granted"] for grant in self.grants)
         self.health.publisher.send_copy(sample)
 
+    def take_changes(self):
+        """Keeps the changes of inputs that have arrived: number, tick, key and values."""
+        while (change := self.input.receive()) is not None:
+            described = self.seat["inputs"][change.input]
+            values = list(change.values)[: described["components"]]
+            self.changes.append([change.number, change.tick, described["key"], values])
+
     def stopped(self):
         """Returns True if the run is over. The launcher announces that before it removes the domain."""
         # Not the domain's directory, because the transport creates it again for a late program.
         gone = not os.path.exists(self.path)
+        self.take_changes()
         schedule = self.schedule.newest()
         if self.terminated or (schedule is not None and schedule.phase >= self.seat["phases"]["stop"]):
             return True
@@ -504,6 +513,7 @@ def main(body=Body):
     parser = argparse.ArgumentParser(description="Take the role of a follower in a corotate run.")
     parser.add_argument("seat", help="the seat file whose path the waiting run prints")
     parser.add_argument("--record", metavar="DIR", help="write all samples published and received to DIR")
+    parser.add_argument("--changes", metavar="FILE", help="write the changes of inputs that it received to FILE")
     parser.add_argument("--silent", action="store_true", help="send samples only, no heartbeats and no report")
     arguments = parser.parse_args()
     terminated = []
@@ -519,6 +529,9 @@ def main(body=Body):
         follower.run()
         if arguments.record:
             follower.write_record(arguments.record)
+        if arguments.changes:
+            with open(arguments.changes, "w", encoding="utf-8") as file:
+                json.dump(follower.changes, file)
     except KeyError as error:
         print(f"follower: {arguments.seat} is not a seat file: {error} is missing", file=sys.stderr)
         return 2

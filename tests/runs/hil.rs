@@ -8,6 +8,7 @@ use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Read, Reader, Signal, Write};
 use corotate::clock::monotonic_ns;
 use corotate::config::ClockKind;
+use corotate::inputs::{Answer, Request, WantedChange, request};
 use corotate::runtime::{Input, Poll, RoleId, RunCondition, Seek, depths, drive_in_turn, private_ledger, topic};
 use corotate::sample::{
     FieldKind, Health, NO_SAMPLE, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, status,
@@ -321,6 +322,43 @@ fn a_waiting_run_writes_the_seat_that_the_seat_command_prints() {
     let (name, failure) = junit_cases(&bench).remove(0);
     assert!(name == "run" && failure.is_some_and(|text| text.starts_with("error: ") && text.contains("signal 2")));
     bench.assert_clean(&domains);
+}
+
+/// The foreign follower sees the change of the scenario and live ones; a recording has them as messages.
+#[test]
+fn a_foreign_role_sees_changes_of_inputs_as_a_signal() {
+    let bench = Bench::new();
+    let scripted = r#"input=[{at_s = 1.0, key = "observer.decay_rate_per_s", value = 9.0}]"#;
+    let fixed = ["--clock", "lockstep", "--set", "accept={}", "--duration", "30", "--record"];
+    let (run, seat) = start_waiting(&bench, &[&fixed[..], &["--set", scripted]].concat());
+    let domain = seat.parent().unwrap().to_owned();
+    let follower = start_follower(&bench, &seat, &["--changes", "changes.json"]);
+    await_ticks(&domain);
+    let set = |gain: f64| {
+        let value = vec![gain; 3].into();
+        let changes = vec![WantedChange { key: "controller.gain_per_s".to_owned(), value, ramp_s: 0.5 }];
+        match request(&domain, &Request::Set { changes, at_tick: None }) {
+            Ok(Answer::Accepted { tick, .. }) => tick,
+            answer => panic!("{answer:?}"),
+        }
+    };
+    let ticks = [set(6.0), set(3.0)];
+    let (run, follower) = (run.wait(), follower.wait());
+    assert_eq!((run.code, follower.code), (Some(0), Some(0)), "{run:?} {follower:?}");
+    let seen: Value = serde_json::from_slice(&std::fs::read(bench.path("changes.json")).unwrap()).unwrap();
+    let gain = "controller.gain_per_s";
+    let expected = serde_json::json!([
+        [0, 1000, "observer.decay_rate_per_s", [9.0]],
+        [1, ticks[0], gain, [6.0; 3]],
+        [2, ticks[1], gain, [3.0; 3]],
+    ]);
+    assert_eq!(seen, expected);
+    let bytes = std::fs::read(bench.path("out/run.mcap")).unwrap();
+    let messages = mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap);
+    let changes = messages.filter(|message| message.channel.topic.ends_with("/run/input"));
+    let recorded: Vec<u64> =
+        changes.map(|message| u64::from_le_bytes(message.data[4..12].try_into().unwrap())).collect();
+    assert_eq!(recorded, [1000, ticks[0], ticks[1]]);
 }
 
 #[test]

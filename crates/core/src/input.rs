@@ -3,6 +3,7 @@
 //! Pure: the same changes give the same bits under every clock and after every restart of a role. This module must not know
 //! what an input means, nor where its changes come from.
 
+use crate::sample::{InputChange, Stamp};
 use core::f64::consts::TAU;
 
 /// The most components of an input.
@@ -74,6 +75,9 @@ pub enum Shape {
 }
 
 impl Shape {
+    /// The names of all shapes, in the order of their numbers.
+    pub const NAMES: [&str; 6] = ["step", "ramp", "pulse", "sine", "chirp", "prbs"];
+
     /// Returns true if it sets the level, false if it adds to the level for a while.
     pub fn sets_level(&self) -> bool {
         matches!(self, Self::Step | Self::Ramp { .. } | Self::Row { .. })
@@ -146,6 +150,20 @@ impl Change {
         head.copy_from_slice(&[self.tick, self.input as u64, number, ticks, first, second]);
         values.iter_mut().zip(self.values).for_each(|(word, value)| *word = value.to_bits());
         words
+    }
+
+    /// Returns the change as the sample with this number, with the tick as its stamp.
+    pub fn sample(&self, number: u64) -> InputChange {
+        let [shape, length_ticks, first, second] = self.shape.words();
+        InputChange {
+            stamp: Stamp { tick: self.tick, generation: 1, ..Stamp::default() },
+            number,
+            input: self.input as u64,
+            shape,
+            length_ticks,
+            parameters: [first, second],
+            values: self.values,
+        }
     }
 
     /// Returns the change with these words; `None` if no change has them.

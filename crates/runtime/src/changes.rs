@@ -11,6 +11,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// The most changes that one run receives.
 pub const CHANGES_MAX: usize = 4096;
+/// The most changes of a scenario.
+pub const SCRIPTED_MAX: usize = 256;
 /// The first word counts the changes, which follow it.
 const WORDS: usize = 1 + CHANGES_MAX * CHANGE_WORDS;
 

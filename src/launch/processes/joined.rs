@@ -14,6 +14,7 @@ impl<'a> Supervisor<'a> {
         relay: RelayWatch,
     ) -> Result<Self, LaunchError> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
+        let changes = ChangeSignal::open(scenario, bus)?;
         let recorder = RecorderWatch::start(None, scenario, domain, bus)?;
         let foxglove = foxglove::start(None, domain)?;
         let own = |role: &RoleId| {
@@ -36,6 +37,7 @@ impl<'a> Supervisor<'a> {
             members,
             externals,
             schedule,
+            changes,
             word,
             incidents,
             recorder,

@@ -24,7 +24,7 @@ pub use layout::{LayoutName, type_name_of};
 pub use orbit::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth};
 pub use order::{Order, Place};
 pub use rigid::{RateCommand, RateEstimate, RateMeasurement, RateTruth};
-pub use run::{Health, Phase, RoleState, Schedule};
+pub use run::{Health, InputChange, Phase, RoleState, Schedule};
 
 use crate::state::Words;
 

@@ -29,6 +29,24 @@ sample! {
     }
 }
 
+sample! {
+    /// A change of an input, published by the launcher before it acts. The stamp's tick is the one from which it acts.
+    InputChange = "corotate/run/input/v1" {
+        /// The number of the change, counted from 0: those of the scenario first, then received ones.
+        number: u64,
+        /// The number of the input.
+        input: u64,
+        /// The number of a shape.
+        shape: u64,
+        /// The length of the shape, ticks.
+        length_ticks: u64,
+        /// The parameters of the shape: frequencies in cycles per tick as bits of an f64, or hold ticks and seed.
+        parameters: [u64; 2],
+        /// The new level or the amplitude; components beyond those of the input are zero.
+        values: [f64; 6],
+    }
+}
+
 /// The phase of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u64)]

@@ -17,6 +17,8 @@ pub enum Signal {
     Health,
     /// The launcher's schedule for all roles.
     Schedule,
+    /// The changes of inputs.
+    Input,
 }
 
 impl Signal {
@@ -29,6 +31,7 @@ impl Signal {
             Self::Command => "command",
             Self::Health => "health",
             Self::Schedule => "schedule",
+            Self::Input => "input",
         }
     }
 }

@@ -4,16 +4,13 @@
 
 use super::checks::Checks;
 use super::nearest;
-use crate::changes::ReceivedChanges;
+use crate::changes::{ReceivedChanges, SCRIPTED_MAX};
 use crate::fault;
 use crate::input::{COMPONENTS_MAX, Change, Course, Shape, Values};
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::sync::{Arc, Mutex};
 use toml::Value;
-
-/// The most `[[input]]` tables of a scenario.
-const INPUTS_MAX: usize = 256;
 
 /// A scenario key that may change while the loop runs.
 #[derive(Debug, Clone, PartialEq)]
@@ -350,8 +347,8 @@ pub(crate) struct Setting<'a> {
 
 /// Checks all `[[input]]` tables and returns their changes. Refused ones are recorded and left out.
 pub(crate) fn resolve(raw: &[RawInput], setting: &Setting<'_>, checks: &mut Checks<'_>) -> Vec<Change> {
-    checks.require(raw.len() <= INPUTS_MAX, "input", "too-many", || {
-        format!("{} are more than a run takes; give at most {INPUTS_MAX}", raw.len())
+    checks.require(raw.len() <= SCRIPTED_MAX, "input", "too-many", || {
+        format!("{} are more than a run takes; give at most {SCRIPTED_MAX}", raw.len())
     });
     let each = raw.iter().enumerate();
     each.filter_map(|(number, raw)| change_of(raw, format!("input[{number}]"), number, setting, checks)).collect()

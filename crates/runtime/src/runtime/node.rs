@@ -81,11 +81,12 @@ pub fn shared_memory_bytes(scenario: &Settings) -> usize {
         let signals = ports.writes.iter().chain([&ports.health]).map(port).sum::<usize>();
         signals + ledger_words(scenario, role) * size_of::<u64>() + record_bytes(scenario, &ports)
     };
-    let Ports { schedule, health, .. } = ports(scenario, RoleId::Observer);
+    let Ports { schedule, health, input, .. } = ports(scenario, RoleId::Observer);
     // The recorder publishes health too.
     COMMON_BYTES
         + ReceivedChanges::BYTES
         + port(&schedule)
+        + port(&input)
         + port(&health)
         + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
 }

@@ -1,6 +1,6 @@
 //! The roles of a scenario by name and number, and the process of each. Must not open anything.
 
-use crate::config::{ClockKind, Settings};
+use crate::config::{ClockKind, InputUser, Settings};
 
 /// A role of a scenario.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -14,6 +14,16 @@ pub enum RoleId {
 }
 
 impl RoleId {
+    /// Returns the role that a user of an input belongs to; `None` for the score.
+    pub fn using(user: InputUser) -> Option<Self> {
+        match user {
+            InputUser::Body(index) | InputUser::Actuator(index) => Some(Self::Plant(index)),
+            InputUser::Observer => Some(Self::Observer),
+            InputUser::Law(_) => Some(Self::Controller),
+            InputUser::Score => None,
+        }
+    }
+
     /// Returns all roles of a scenario in the order of a tick.
     pub fn all(scenario: &Settings) -> Vec<Self> {
         let plants = (0..scenario.bodies.len()).map(Self::Plant);

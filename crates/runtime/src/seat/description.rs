@@ -6,6 +6,8 @@ use super::process::{RoleError, WARM_UP_PAUSE_NS, WARM_UP_SAMPLES, report_path, 
 use crate::bus::domain::Domain;
 use crate::bus::iox::{self, Qos};
 use crate::bus::{Depths, Port, Reader, Signal};
+use crate::config::{InputInfo, Variability};
+use crate::input::Shape;
 use crate::role::Rearm;
 use crate::runtime::{RoleId, depths, ports, window_ticks};
 use crate::sample::{Field, FieldKind, NO_SAMPLE, Phase, RoleState, Stamp, status};
@@ -46,6 +48,11 @@ pub struct SeatDescription {
     /// The role's heartbeat, and the launcher's schedule.
     health: SignalDescription,
     schedule: SignalDescription,
+    /// The changes of inputs, and the inputs in the order of their numbers.
+    input: SignalDescription,
+    inputs: Vec<InputDescription>,
+    /// The numbers of the shapes of a change.
+    shapes: BTreeMap<&'static str, usize>,
     /// The values of the schedule's `phase` and of health's `state`.
     phases: BTreeMap<&'static str, u64>,
     states: BTreeMap<&'static str, u64>,
@@ -102,6 +109,23 @@ struct FieldDescription {
     count: usize,
 }
 
+/// An input: a scenario key that may change while the loop runs.
+#[derive(Debug, Serialize)]
+struct InputDescription {
+    number: usize,
+    /// The key; its last part ends with the unit.
+    key: String,
+    description: String,
+    variability: Variability,
+    components: usize,
+    /// The values until the first change.
+    initial: Vec<f64>,
+    /// The least and the largest value of a component; null where there is none.
+    range: [Option<f64>; 2],
+    /// The names of the roles that use it.
+    users: Vec<String>,
+}
+
 /// Exercise of the links before the first tick: number of samples of generation 0, and their interval.
 #[derive(Debug, Serialize)]
 struct WarmUp {
@@ -141,6 +165,9 @@ pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>)
         reads: ports.reads.iter().map(read).collect(),
         health: written(&ports.health),
         schedule: read(&ports.schedule),
+        input: read(&ports.input),
+        inputs: inputs(scenario),
+        shapes: Shape::NAMES.into_iter().zip(0..).collect(),
         phases: Phase::NAMES.into_iter().map(|(name, phase)| (name, phase as u64)).collect(),
         states: RoleState::NAMES.into_iter().map(|(name, state)| (name, state as u64)).collect(),
         status: status::NAMES.into_iter().collect(),
@@ -149,6 +176,27 @@ pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>)
         report: domain.map(|domain| report_path(domain.root(), name)),
         scenario: scenario.resolved.clone(),
     }
+}
+
+/// Describes the inputs of a scenario.
+fn inputs(scenario: &Scenario) -> Vec<InputDescription> {
+    let describe = |(number, info): (usize, &InputInfo)| {
+        let roles = info.uses.iter().filter_map(|by| RoleId::using(by.user));
+        let mut users: Vec<String> = roles.map(|role| role.name(scenario).to_owned()).collect();
+        users.dedup();
+        let (least, largest) = info.range;
+        InputDescription {
+            number,
+            key: info.key.clone(),
+            description: info.description.clone().into_owned(),
+            variability: info.variability,
+            components: info.initial.len(),
+            initial: info.initial.clone(),
+            range: [least, largest].map(|bound| Some(bound).filter(|bound| bound.is_finite())),
+            users,
+        }
+    };
+    scenario.inputs.infos.iter().enumerate().map(describe).collect()
 }
 
 impl SeatDescription {
@@ -237,7 +285,7 @@ mod tests {
             let scenario = Scenario::parse(text, name, &[]).unwrap();
             for role in RoleId::all(&scenario) {
                 let seat = describe_seat(&scenario, role, None);
-                for signal in seat.writes.iter().chain(&seat.reads).chain([&seat.health, &seat.schedule]) {
+                for signal in seat.writes.iter().chain(&seat.reads).chain([&seat.health, &seat.schedule, &seat.input]) {
                     let end = signal.fields.iter().fold(0, |end, field| {
                         assert_eq!(field.offset, end, "{}: {}", signal.service, field.name);
                         end + 8 * field.count
@@ -262,6 +310,17 @@ mod tests {
         assert_eq!(seat["writes"][0]["qos"]["subscriber_max_buffer_size"], 128);
         assert_eq!(seat["schedule"]["buffer_size"], 1);
         assert_eq!(seat["transport"]["prefix"], domain.domain().prefix());
+        let place =
+            seat["inputs"].as_array().unwrap().iter().position(|input| input["key"] == "follower.0.disturbance_rad_s2");
+        let disturbance = &seat["inputs"][place.unwrap()];
+        assert_eq!((&disturbance["number"], &disturbance["components"]), (&place.into(), &3.into()));
+        assert_eq!(disturbance["users"], serde_json::json!(["follower"]));
+        assert_eq!(disturbance["range"][0], Value::Null);
+        assert_eq!(
+            (&seat["input"]["service"], &seat["shapes"]["ramp"]),
+            (&"corotate/rigid-pair/run/input".into(), &1.into())
+        );
+        assert!(seat["input"]["buffer_size"].as_u64() >= seat["input"]["qos"]["history_size"].as_u64());
         assert_eq!(seat["phases"]["warm_up"], 1);
         assert_eq!(seat["states"]["done"], 4);
         assert_eq!(seat["status"]["fault"], 512);

@@ -4,6 +4,7 @@ use super::cause;
 use crate::bus::domain::Domain;
 use crate::bus::notifier::NOTIFIERS_BYTES;
 use crate::bus::{Depths, Reader, Signal, WriterProcess};
+use crate::changes::{CHANGES_MAX, SCRIPTED_MAX};
 use crate::sample::Sample;
 use iceoryx2::config::Config;
 use iceoryx2::prelude::*;
@@ -20,6 +21,8 @@ const MAX_SCHEDULE_READERS: usize = 128;
 pub(super) const MAX_READERS: usize = 8;
 /// Upper bound on the readers of a fleet's signal, whose samples are large: role, scorer, recorder, one watcher.
 const MAX_FLEET_READERS: usize = 4;
+/// Upper bound on the readers of the changes of inputs: foreign programs. All changes of a run wait for a new one.
+const MAX_INPUT_READERS: usize = 4;
 /// Samples that a reader holds at once: the current one, and the next during the exchange.
 const MAX_BORROWED: usize = 2;
 /// Time limit of the transport for a file that another process creates. Longer than any maker is delayed, because the
@@ -70,7 +73,11 @@ impl Qos {
     pub fn for_signal(signal: Signal, depths: Depths) -> Self {
         Self {
             max_publishers: 1,
-            max_subscribers: if signal == Signal::Schedule { MAX_SCHEDULE_READERS } else { MAX_READERS },
+            max_subscribers: match signal {
+                Signal::Schedule => MAX_SCHEDULE_READERS,
+                Signal::Input => MAX_INPUT_READERS,
+                _ => MAX_READERS,
+            },
             max_nodes: MAX_NODES,
             history_size: history(signal, depths),
             subscriber_max_buffer_size: deepest(signal, depths),
@@ -87,13 +94,17 @@ impl Qos {
 
 /// Returns the queue depth of a reader of a signal.
 pub fn buffer_size(signal: Signal, reader: Reader, depths: Depths) -> usize {
-    depths.for_reader(reader).min(deepest(signal, depths))
+    match signal {
+        Signal::Input => deepest(signal, depths),
+        _ => depths.for_reader(reader).min(deepest(signal, depths)),
+    }
 }
 
 /// Returns the number of past samples for new readers. Health and schedule need none: they are published repeatedly.
 fn history(signal: Signal, depths: Depths) -> usize {
     match signal {
         Signal::Health | Signal::Schedule => 0,
+        Signal::Input => CHANGES_MAX + SCRIPTED_MAX,
         Signal::Truth | Signal::Measurement | Signal::Estimate | Signal::Command => depths.history,
     }
 }
@@ -103,6 +114,7 @@ fn deepest(signal: Signal, depths: Depths) -> usize {
     match signal {
         Signal::Truth | Signal::Measurement | Signal::Estimate | Signal::Command => depths.scorer.max(depths.role),
         Signal::Health | Signal::Schedule => 1,
+        Signal::Input => history(signal, depths),
     }
 }
 

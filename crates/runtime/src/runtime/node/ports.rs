@@ -5,7 +5,7 @@
 use crate::bus::{Port, Signal, Topic};
 use crate::config::{BodyInfo, Settings};
 use crate::runtime::RoleId;
-use crate::sample::{Health, Schedule};
+use crate::sample::{Health, InputChange, Schedule};
 
 /// The signals of a role.
 #[derive(Debug, Clone)]
@@ -18,6 +18,8 @@ pub struct Ports {
     pub health: Port,
     /// The launcher's schedule.
     pub schedule: Port,
+    /// The changes of inputs, for roles of foreign programs: the others read the shared list.
+    pub input: Port,
 }
 
 /// Returns the driven bodies in the controller's order: single bodies, then fleets.
@@ -54,6 +56,7 @@ pub fn ports(settings: &Settings, role: RoleId) -> Ports {
         reads,
         health: Port::new::<Health>(topic(settings, role.name(settings), Signal::Health), None),
         schedule: Port::new::<Schedule>(topic(settings, "run", Signal::Schedule), None),
+        input: Port::new::<InputChange>(topic(settings, "run", Signal::Input), None),
     }
 }
 
