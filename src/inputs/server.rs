@@ -7,7 +7,7 @@ use crate::bus::domain::Domain;
 use crate::changes::ReceivedChanges;
 use crate::config::{InputInfo, Settings};
 use crate::input::{Change, Shape};
-use crate::runtime::RoleId;
+use crate::runtime::{RoleId, ignoring_role};
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
@@ -78,21 +78,21 @@ impl InputServer {
         Ok(Self { requests, pending: Vec::new(), path, stopped, thread: Some(thread) })
     }
 
-    /// Serves the waiting requests, and appends the pending changes that are due. `is_absent` returns true for a role that takes no
-    /// inputs: one that another program runs.
+    /// Serves the waiting requests, and appends the pending changes that are due. `ignores` returns true for a role that takes no
+    /// inputs: one that another program runs, without this library.
     pub fn poll(
         &mut self,
         scenario: &Settings,
         list: &ReceivedChanges,
         timing: &dyn Fn() -> Timing,
-        is_absent: &dyn Fn(RoleId) -> bool,
+        ignores: &dyn Fn(RoleId) -> bool,
     ) {
         self.append_pending(list, timing().horizon);
         while let Ok((request, reply)) = self.requests.try_recv() {
             let answer = match &request {
                 Request::Get => values(scenario, timing().earliest),
                 Request::Set { changes, at_tick } => {
-                    self.set(scenario, list, timing, is_absent, changes, *at_tick).unwrap_or_else(|refusal| refusal)
+                    self.set(scenario, list, timing, ignores, changes, *at_tick).unwrap_or_else(|refusal| refusal)
                 }
             };
             // A client that has gone has its change all the same.
@@ -117,12 +117,11 @@ impl InputServer {
         scenario: &Settings,
         list: &ReceivedChanges,
         timing: &dyn Fn() -> Timing,
-        is_absent: &dyn Fn(RoleId) -> bool,
+        ignores: &dyn Fn(RoleId) -> bool,
         wanted: &[WantedChange],
         at_tick: Option<u64>,
     ) -> Result<Answer, Answer> {
-        let changes =
-            wanted.iter().map(|wanted| resolve(scenario, wanted, is_absent)).collect::<Result<Vec<_>, _>>()?;
+        let changes = wanted.iter().map(|wanted| resolve(scenario, wanted, ignores)).collect::<Result<Vec<_>, _>>()?;
         if changes.is_empty() {
             return Err(Answer::refused("no-change", "the request changes nothing; name a key and its value"));
         }
@@ -206,11 +205,11 @@ fn values(scenario: &Settings, tick: u64) -> Answer {
 /// Returns a wanted change, with tick 0.
 ///
 /// # Errors
-/// A refusal. `is_absent` returns true for a role that takes no inputs.
+/// A refusal. `ignores` returns true for a role that takes no inputs.
 pub(crate) fn resolve(
     scenario: &Settings,
     wanted: &WantedChange,
-    is_absent: &dyn Fn(RoleId) -> bool,
+    ignores: &dyn Fn(RoleId) -> bool,
 ) -> Result<Change, Answer> {
     let (input, info) = scenario.inputs.find(&wanted.key).map_err(|reason| Answer::refused("not-tunable", reason))?;
     let InputInfo { key, .. } = info;
@@ -220,10 +219,7 @@ pub(crate) fn resolve(
         let (least, largest) = info.range;
         return Err(Answer::refused("out-of-range", format!("{key} is out of range; give {least} to {largest}")));
     }
-    let absent = info.uses.iter().filter_map(|by| RoleId::using(by.user)).find(|role| is_absent(*role));
-    if let Some(absent) = absent {
-        let name = absent.name(scenario);
-        let reason = format!("{key} is used by {name}, which another program runs: it takes no inputs");
+    if let Some(reason) = ignoring_role(scenario, info, ignores) {
         return Err(Answer::refused("external-role", reason));
     }
     let ticks = (wanted.ramp_s / scenario.tick_s()).round();

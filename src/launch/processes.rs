@@ -31,14 +31,16 @@ use crate::inputs::{InputServer, Timing};
 use crate::late::TRACER;
 use crate::record::RECORDER;
 use crate::runtime::{
-    Backoff, RoleId, depths, hold_low_latency_idle, report, request_short_slices, shared_memory_bytes, topic,
-    window_ticks,
+    Backoff, RoleId, depths, hold_low_latency_idle, ignored_changes, report, request_short_slices, shared_memory_bytes,
+    topic, window_ticks,
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
 use crate::scenario::Scenario;
 use crate::scenario::scorer as open_scorer;
 use crate::score::Scorer;
-use crate::seat::{changes_path, describe_seat, report_path, results_path, scenario_path, seat_path, write_whole};
+use crate::seat::{
+    changes_path, describe_seat, listening_process, report_path, results_path, scenario_path, seat_path, write_whole,
+};
 use crate::system::tell;
 use crate::telemetry::{Grant, Ledger, Outage, RoleReport};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -173,6 +175,23 @@ pub(super) fn share_changes(scenario: &Scenario, domain: &Domain) -> Result<(), 
 
 fn is_external(scenario: &Scenario, launch: &Launch<'_>, role: &str) -> bool {
     launch.external.iter().chain(&scenario.external).any(|external| external == role)
+}
+
+/// Returns true if changes of inputs do not reach a role: it is on another host, or the program that runs it does not read them.
+fn takes_no_inputs(
+    scenario: &Scenario,
+    launch: &Launch<'_>,
+    domain: &Domain,
+    members: &[Member],
+    role: RoleId,
+) -> bool {
+    let name = role.name(scenario);
+    if elsewhere(scenario, launch, name).is_some() {
+        return true;
+    }
+    let process = || members.iter().find(|member| member.books().any(|(own, _)| own == role))?.pid();
+    is_external(scenario, launch, name)
+        && listening_process(domain.root(), name).is_none_or(|listener| process().is_some_and(|pid| pid != listener))
 }
 
 /// Returns the other host that runs a role, if one does.
@@ -346,6 +365,7 @@ impl<'a> Supervisor<'a> {
         if !self.await_debuggers(scorer, launch)? {
             return Ok(launch.signal.load(Ordering::Relaxed));
         }
+        self.warn_of_ignored_changes(launch);
         self.word.phase = Phase::Run as u64;
         if self.scenario.clock == ClockKind::Realtime {
             let lead_ns = if launch.host.is_some() { EPOCH_LEAD_HOSTS_NS } else { EPOCH_LEAD_NS };
@@ -555,14 +575,25 @@ impl<'a> Supervisor<'a> {
                 Timing { earliest, safe: earliest, horizon: earliest + window_ticks(scenario), clock: None }
             }
         };
-        let is_absent = |role: RoleId| {
-            let name = role.name(scenario);
-            is_external(scenario, launch, name) || elsewhere(scenario, launch, name).is_some()
-        };
+        let (domain, members) = (self.domain, &self.members);
+        let ignores = |role: RoleId| takes_no_inputs(scenario, launch, domain, members, role);
         if let Some(inputs) = &mut self.inputs {
-            inputs.poll(scenario, &self.received, &timing, &is_absent);
+            inputs.poll(scenario, &self.received, &timing, &ignores);
         }
         self.changes.publish()
+    }
+
+    /// Prints which changes of the scenario a role ignores.
+    fn warn_of_ignored_changes(&self, launch: &Launch<'_>) {
+        let (scenario, domain, members) = (self.scenario, self.domain, &self.members);
+        // A role of this program on another host reads the changes of the scenario.
+        let ignores = |role: RoleId| {
+            elsewhere(scenario, launch, role.name(scenario)).is_none()
+                && takes_no_inputs(scenario, launch, domain, members, role)
+        };
+        for reason in ignored_changes(scenario, &ignores) {
+            tell(format_args!("corotate: {reason}; the role ignores its changes in the scenario"));
+        }
     }
 
     /// Restarts roles that have failed, and records hosts that left; returns false if the run must end. `note` receives the number

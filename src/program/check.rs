@@ -7,6 +7,7 @@ use super::set::tunable;
 use crate::analysis::{Claim, Reach, apart, digits};
 use crate::campaign::Campaign;
 use crate::launch::check_cores;
+use crate::runtime::{RoleId, ignored_changes};
 use crate::scenario::Scenario;
 use crate::scenario::claims;
 use std::fmt::Write;
@@ -110,7 +111,7 @@ fn json(path: &Path, scenario: &Scenario) -> String {
         "clock": scenario.clock.name(),
         "tick_hz": 1.0 / scenario.tick_s(),
         "notes": scenario.notes(),
-        "warnings": scenario.warnings,
+        "warnings": warnings(scenario),
         "limits": scenario.rig.limits(),
         "inputs": scenario.inputs.infos.iter().map(|info| serde_json::json!({
             "key": info.key,
@@ -124,6 +125,12 @@ fn json(path: &Path, scenario: &Scenario) -> String {
     format!("{value}\n")
 }
 
+/// Returns the warnings about a scenario, and of its changes of inputs that an external role may ignore.
+fn warnings(scenario: &Scenario) -> Vec<String> {
+    let is_external = |role: RoleId| scenario.external.iter().any(|name| name == role.name(scenario));
+    scenario.warnings.iter().cloned().chain(ignored_changes(scenario, &is_external)).collect()
+}
+
 /// Writes the convergence of the sampled loops, warnings and notes, then the theorems and the limits of the guards.
 fn write_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
     let claims = claims(scenario);
@@ -135,7 +142,7 @@ fn write_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
         ticks => format!("{ticks} ticks"),
     };
     claims.iter().try_for_each(|claim| write_loop(claim, &late, text))?;
-    scenario.warnings.iter().try_for_each(|warning| writeln!(text, "warning: {warning}"))?;
+    warnings(scenario).iter().try_for_each(|warning| writeln!(text, "warning: {warning}"))?;
     scenario.notes().iter().try_for_each(|note| writeln!(text, "note: {note}"))?;
     claims.iter().try_for_each(|claim| write_theorem(claim, text))?;
     let limits = scenario.rig.limits();

@@ -4,6 +4,7 @@
 use crate::common::{Bench, Running, await_some};
 use bytemuck::{bytes_of, from_bytes};
 use corotate::config::SHIPPED;
+use corotate::inputs::{Answer, Request, WantedChange, current, request};
 use corotate::launch::{Launch, LaunchError, Outcome, Steps, Summary, run};
 use corotate::rig::{Command, Estimate, Measurement, Rig, RigidBodyRig};
 use corotate::role::Controller;
@@ -135,6 +136,28 @@ fn start_waiting(bench: &Bench, options: &[&str]) -> (Running, RoleAddress) {
     let running = bench.start(&[&waits[..], options].concat());
     let domain = bench.await_seat("controller").parent().unwrap().to_owned();
     (running, RoleAddress { domain, role: "controller".to_owned() })
+}
+
+/// A function can read the changes of inputs: they are accepted for its role.
+#[test]
+fn changes_are_accepted_for_a_role_of_a_function() {
+    let bench = Bench::new();
+    let (running, seat) = start_waiting(&bench, &["--clock", "lockstep", "--duration", "3600"]);
+    let domain = seat.domain.clone();
+    let function = std::thread::spawn(move || {
+        let laws = Laws::new(&scenario("rigid-pair", &[]));
+        run_function(&seat, Box::new(laws), &AtomicBool::new(false))
+    });
+    await_some(|| current(&domain).ok());
+    let changes =
+        vec![WantedChange { key: "controller.gain_per_s".to_owned(), value: vec![6.0; 3].into(), ramp_s: 0.0 }];
+    let answer = request(&domain, &Request::Set { changes, at_tick: None }).unwrap();
+    assert!(matches!(answer, Answer::Accepted { .. }), "{answer:?}");
+    running.signal(15);
+    let done = running.wait();
+    assert_eq!(done.code, Some(128 + 15), "{done:?}");
+    assert!(!done.stderr.contains("takes no changes of inputs"), "{done:?}");
+    function.join().unwrap().unwrap();
 }
 
 /// The error itself ends the run, not the silence that follows: the heartbeat timeout is an hour.

@@ -328,7 +328,8 @@ fn a_waiting_run_writes_the_seat_that_the_seat_command_prints() {
 #[test]
 fn a_foreign_role_sees_changes_of_inputs_as_a_signal() {
     let bench = Bench::new();
-    let scripted = r#"input=[{at_s = 1.0, key = "observer.decay_rate_per_s", value = 9.0}]"#;
+    let scripted = r#"input=[{at_s = 1.0, key = "observer.decay_rate_per_s", value = 9.0},
+        {at_s = 2.0, key = "follower.0.disturbance_rad_s2", value = [0.0, 0.0, 0.0]}]"#;
     let fixed = ["--clock", "lockstep", "--set", "accept={}", "--duration", "30", "--record"];
     let (run, seat) = start_waiting(&bench, &[&fixed[..], &["--set", scripted]].concat());
     let domain = seat.parent().unwrap().to_owned();
@@ -343,14 +344,21 @@ fn a_foreign_role_sees_changes_of_inputs_as_a_signal() {
         }
     };
     let ticks = [set(6.0), set(3.0)];
+    // The follower's program does not take a change for itself.
+    let own = WantedChange { key: "actuator.safe".to_owned(), value: true.into(), ramp_s: 0.0 };
+    match request(&domain, &Request::Set { changes: vec![own], at_tick: None }) {
+        Ok(Answer::Refused { code, .. }) => assert_eq!(code, "external-role"),
+        answer => panic!("{answer:?}"),
+    }
     let (run, follower) = (run.wait(), follower.wait());
     assert_eq!((run.code, follower.code), (Some(0), Some(0)), "{run:?} {follower:?}");
     let seen: Value = serde_json::from_slice(&std::fs::read(bench.path("changes.json")).unwrap()).unwrap();
     let gain = "controller.gain_per_s";
     let expected = serde_json::json!([
         [0, 1000, "observer.decay_rate_per_s", [9.0]],
-        [1, ticks[0], gain, [6.0; 3]],
-        [2, ticks[1], gain, [3.0; 3]],
+        [1, 2000, "follower.0.disturbance_rad_s2", [0.0; 3]],
+        [2, ticks[0], gain, [6.0; 3]],
+        [3, ticks[1], gain, [3.0; 3]],
     ]);
     assert_eq!(seen, expected);
     let bytes = std::fs::read(bench.path("out/run.mcap")).unwrap();
@@ -358,7 +366,12 @@ fn a_foreign_role_sees_changes_of_inputs_as_a_signal() {
     let changes = messages.filter(|message| message.channel.topic.ends_with("/run/input"));
     let recorded: Vec<u64> =
         changes.map(|message| u64::from_le_bytes(message.data[4..12].try_into().unwrap())).collect();
-    assert_eq!(recorded, [1000, ticks[0], ticks[1]]);
+    assert_eq!(recorded, [1000, 2000, ticks[0], ticks[1]]);
+    let ignored = |text: &str| text.contains("follower.0.disturbance_rad_s2 is used by follower");
+    assert!(ignored(&run.stderr), "{}", run.stderr);
+    let scenario = file("pair.toml");
+    let external = ["check", scenario.to_str().unwrap(), "--set", "launch.external=[\"follower\"]", "--set", scripted];
+    assert!(ignored(&bench.run(&external).succeeded().stdout));
 }
 
 #[test]

@@ -10,6 +10,7 @@ mod disturb;
 pub(crate) mod drive;
 mod error;
 pub(crate) mod hooks;
+mod ignored;
 mod late_watch;
 mod line;
 mod link;
@@ -27,6 +28,7 @@ pub use device::{DeviceConfig, DeviceLink};
 pub use disturb::{Disturbance, Interruptions, LateSamples};
 pub use drive::{Backoff, Driver, Ended, LauncherLink, drive_in_turn, drive_in_turn_tracked, run_in_turn};
 pub use error::{DeviceError, NodeError};
+pub use ignored::{ignored_changes, ignoring_role};
 pub use late_watch::LateWatch;
 pub use line::{Line, LineError};
 #[cfg(feature = "hosts")]

@@ -15,8 +15,8 @@ pub use description::{SeatDescription, describe_seat, join_run, seat_path};
 pub use process::SUMMARY;
 pub use process::{RoleAddress, RoleEnvironment, RoleError, find_run, run_function, run_role, serve};
 pub use process::{
-    changes_path, device_failure_path, failure_path, join_complete, open_ledger, panic_path, report_path, results_path,
-    scenario_of, scenario_path, write_whole,
+    changes_path, device_failure_path, failure_path, join_complete, listening_process, open_ledger, panic_path,
+    report_path, results_path, scenario_of, scenario_path, write_whole,
 };
 #[cfg(feature = "hosts")]
 pub use process::{clock_path, join};

@@ -189,6 +189,16 @@ pub fn report_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.report.json"))
 }
 
+/// Returns the file in a domain's directory that shows that a role takes changes of inputs. It contains the number of the process.
+fn listener_path(root: &Path, role: &str) -> PathBuf {
+    root.join(format!("{role}.listens"))
+}
+
+/// Returns the process that declared that it takes changes of inputs for a role. Bridges of devices do not.
+pub fn listening_process(root: &Path, role: &str) -> Option<i32> {
+    std::fs::read_to_string(listener_path(root, role)).ok()?.parse().ok()
+}
+
 /// Returns the file in a domain's directory for the error that ended an external role.
 pub fn failure_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.words"))
@@ -345,6 +355,13 @@ pub(super) fn in_domain(
     if roles.iter().any(|role| scenario.debug.iter().any(|name| name == role)) {
         // Yama restricts debuggers to the parent process; without Yama this call fails and is not needed.
         let _ = rustix::process::set_ptracer(rustix::process::PTracer::Any);
+    }
+    if !matches!(role_impl, RoleImpl::Device(..)) {
+        // For the launcher, before it can read a heartbeat.
+        for path in roles.iter().map(|role| listener_path(domain.root(), role)) {
+            let process = std::process::id().to_string();
+            write_whole(&path, process.as_bytes()).map_err(|source| RoleError::Report { path, source })?;
+        }
     }
     hooks::enter(&roles, ledger.generation() + 1);
     hooks::at(Failpoint::Opening);
