@@ -7,7 +7,7 @@ mod logs;
 mod recording;
 mod run;
 mod seat;
-mod steps;
+mod session;
 mod sweep;
 
 use pyo3::prelude::*;
@@ -21,7 +21,7 @@ fn _corotate(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(run::late_ticks, module)?)?;
     module.add_function(wrap_pyfunction!(run::certificate, module)?)?;
     module.add_function(wrap_pyfunction!(run::shipped, module)?)?;
-    module.add_function(wrap_pyfunction!(seat::describe, module)?)?;
+    module.add_function(wrap_pyfunction!(seat::seat, module)?)?;
     module.add_function(wrap_pyfunction!(seat::serve, module)?)?;
     module.add_function(wrap_pyfunction!(seat::domain_of, module)?)?;
     module.add_function(wrap_pyfunction!(logs::identify, module)?)?;
@@ -31,7 +31,7 @@ fn _corotate(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(inputs::set_inputs, module)?)?;
     module.add_function(wrap_pyfunction!(inputs::get_inputs, module)?)?;
     module.add_class::<seat::Ticks>()?;
-    module.add_class::<steps::Steps>()?;
+    module.add_class::<session::Session>()?;
     module.add_class::<sweep::Cases>()?;
     module.add_class::<sweep::Results>()?;
     module.add_class::<recording::Recording>()?;

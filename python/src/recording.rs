@@ -49,11 +49,10 @@ impl Recording {
         self.recorded.signals().iter().map(signal).collect()
     }
 
-    /// Scenario, clock, period in ns, and the scenario as TOML.
-    fn info(&self) -> PyResult<(String, String, u64, String)> {
+    /// Scenario, clock, period in ns, and the scenario as TOML, which may have a rig that this package does not know.
+    fn info(&self) -> (String, String, u64, String) {
         let info = self.recorded.info();
-        let scenario = self.recorded.scenario().map_err(failed)?;
-        Ok((info.scenario_name.clone(), info.clock.to_string(), info.period_ns, scenario.to_toml()))
+        (info.scenario_name.clone(), info.clock.clone(), info.period_ns, info.scenario.clone())
     }
 
     /// All samples of each of these signals that were sent for a tick, one after the other, as words of eight bytes; and the words of

@@ -1,10 +1,10 @@
 //! Runs, and what may be claimed of them.
 
 use corotate::Program;
-use corotate::config::{RunId, SHIPPED};
+use corotate::config::{ConfigError, RunId, SHIPPED};
 use corotate::late::{LateReport, LateTick};
 use corotate::launch::{
-    Launch, Outcome, Progress, Summary, claim, make_directory, make_latest, new_run, run as launch, write_run,
+    Launch, Outcome, Progress, ScenarioKind, Summary, claim, make_directory, make_latest, new_run, run as launch, write_run,
 };
 use corotate::scenario::Scenario;
 use corotate::scenario::shipped as rigs;
@@ -33,7 +33,10 @@ pub fn failed(error: impl Display) -> PyErr {
 
 /// Returns an exception whose `code` is the stable code of the error.
 pub fn coded(error: impl Display, code: &str) -> PyErr {
-    let error = failed(error);
+    with_code(failed(error), Some(code))
+}
+
+fn with_code(error: PyErr, code: Option<&str>) -> PyErr {
     Python::attach(|py| error.value(py).setattr("code", code)).map_or_else(|failure| failure, |()| error)
 }
 
@@ -63,25 +66,34 @@ pub fn shipped() -> Vec<(&'static str, &'static str)> {
     SHIPPED.to_vec()
 }
 
-/// A scenario by its path, by the name of one that ships, or as JSON of its tables.
-pub fn scenario(given: &str, kind: &str, overrides: &[String]) -> PyResult<Scenario> {
+/// Reads a scenario by its path, by the name of one that ships, or from its text.
+pub fn load(given: &str, kind: ScenarioKind, overrides: &[String]) -> Result<Scenario, ConfigError> {
     match kind {
-        "tables" => {
-            let tables: toml::Table = serde_json::from_str(given).map_err(refused)?;
-            let text = toml::to_string(&tables).map_err(refused)?;
-            Scenario::parse(&text, "the scenario given", overrides)
-        }
-        "name" => {
+        ScenarioKind::Text => Scenario::parse(given, "the scenario given", overrides),
+        ScenarioKind::Name => {
             let named = SHIPPED.iter().find(|(name, _)| *name == given);
             let names = || SHIPPED.map(|(name, _)| name).join(", ");
-            let known = || {
-                refused(format!("there is no scenario `{given}`; known here: {}. A file is given by its path", names()))
+            let unknown = || ConfigError::Unknown {
+                code: "unknown-scenario",
+                text: format!("there is no scenario `{given}`; known here: {}. A file is given by its path", names()),
             };
-            Scenario::parse(named.ok_or_else(known)?.1, given, overrides)
+            Scenario::parse(named.ok_or_else(unknown)?.1, given, overrides)
         }
-        _ => Scenario::load(Path::new(given), overrides),
+        ScenarioKind::Path => Scenario::load(Path::new(given), overrides),
     }
-    .map_err(refused)
+}
+
+/// The same, for callers in Python.
+pub fn scenario(given: &str, kind: &str, overrides: &[String]) -> PyResult<Scenario> {
+    let kind = match kind {
+        "name" => ScenarioKind::Name,
+        "text" => ScenarioKind::Text,
+        _ => ScenarioKind::Path,
+    };
+    load(given, kind, overrides).map_err(|error| {
+        let code = error.mistakes().first().map(|(_, code)| *code);
+        with_code(refused(error), code)
+    })
 }
 
 /// Runs a scenario; gives its summary as JSON and its directory. `tell` gets `("waiting", domain)` and `("running", tick)` now and
@@ -101,15 +113,16 @@ pub fn run(
     require_realtime: bool,
     tell: Option<Py<PyAny>>,
 ) -> PyResult<(String, PathBuf)> {
-    let id: RunId = new_run().map_err(failed)?;
+    let id: RunId = new_run().map_err(|error| coded(error, "no-random-numbers"))?;
     let mut scenario = scenario(given, kind, &overrides)?;
     scenario.run = Some(id);
     external
         .iter()
         .try_for_each(|role| scenario.check_external(role).map_err(|reason| refused(format!("{role}: {reason}"))))?;
     let started = SystemTime::now();
-    let directory = make_directory(out.as_deref(), &scenario.name, started).map_err(failed)?;
-    let _claim = claim(&directory, id, overwrite).map_err(failed)?;
+    let directory = make_directory(out.as_deref(), &scenario.name, started)
+        .map_err(|error| coded(error, "cannot-use-directory"))?;
+    let _claim = claim(&directory, id, overwrite).map_err(|error| coded(&error, (&error).into()))?;
     let signal = AtomicUsize::new(0);
     let mut raised: Option<PyErr> = None;
     let ended: Result<String, PyErr> = py.detach(|| {
@@ -137,7 +150,7 @@ pub fn run(
             ..Launch::new(&signal, &mut progress)
         };
         // Results are written before what is left of the run is put away.
-        let outcome: Outcome = launch(&scenario, launched).map_err(failed)?;
+        let outcome: Outcome = launch(&scenario, launched).map_err(|error| coded(&error, (&error).into()))?;
         let summary = Summary::new(&scenario, &outcome, started);
         write_run(&directory, &scenario, &summary, outcome.late.as_ref()).map_err(failed)?;
         let _ = make_latest(&directory);

@@ -1,11 +1,9 @@
 //! A role's seat: its samples to a function, or to a loop that asks for tick after tick.
 
 use crate::run::{failed, scenario};
-use corotate::bus::Port;
-use corotate::runtime::{RoleFunction, RoleId, TickSamples, ports};
-use corotate::sample::{FieldKind, Stamp};
-use corotate::scenario::Scenario;
-use corotate::seat::{RoleAddress, run_function};
+use corotate::runtime::{RoleFunction, RoleId, TickSamples};
+use corotate::sample::Stamp;
+use corotate::seat::{RoleAddress, describe_seat, run_function};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 use std::path::PathBuf;
@@ -20,42 +18,14 @@ const LOOK: Duration = Duration::from_millis(50);
 /// The error of a function whose role has ended.
 const LEFT: &str = "this role is not computed any more";
 
-/// A signal: body and signal, and each field with its kind, count and offset in bytes after the stamp.
-pub type LayoutOf = (String, String, Vec<(String, String, usize, usize)>);
-
-/// The layouts that a role reads, and those that it writes.
-pub type Seat = (Vec<LayoutOf>, Vec<LayoutOf>);
-
-/// The layouts of what a role reads and writes.
-fn layouts(ports: &[Port]) -> Vec<LayoutOf> {
-    let kind = |kind: FieldKind| if kind == FieldKind::F64 { "f8" } else { "u8" }.to_owned();
-    let layout = |port: &Port| {
-        let field = |field: &corotate::sample::Field| {
-            (field.name.to_owned(), kind(field.kind), field.count, field.offset - size_of::<Stamp>())
-        };
-        (port.topic.body.clone(), port.topic.signal.name().to_owned(), port.fields.iter().map(field).collect())
-    };
-    ports.iter().map(layout).collect()
-}
-
-/// Returns the layouts that a role of a scenario reads and writes.
-pub fn seat_of(scenario: &Scenario, role: &str) -> PyResult<Seat> {
-    let known = scenario.rig.roles().join(", ");
-    let id = RoleId::named(scenario, role)
-        .ok_or_else(|| failed(format!("there is no role `{role}`; known here: {known}")))?;
-    let ports = ports(scenario, id);
-    Ok((layouts(&ports.reads), layouts(&ports.writes)))
-}
-
-/// The same for a scenario by name, path or tables, or for that of a run under way by its domain; and its tick, s.
+/// Returns the seat of a role of a scenario by name, path or text, as JSON.
 #[pyfunction]
-pub fn describe(given: &str, kind: &str, role: &str) -> PyResult<(Vec<LayoutOf>, Vec<LayoutOf>, f64)> {
-    let scenario = match kind {
-        "domain" => scenario(&format!("{given}/scenario.toml"), "path", &[])?,
-        _ => scenario(given, kind, &[])?,
-    };
-    let (reads, writes) = seat_of(&scenario, role)?;
-    Ok((reads, writes, scenario.tick_s()))
+pub fn seat(given: &str, kind: &str, role: &str) -> PyResult<String> {
+    let scenario = scenario(given, kind, &["clock=lockstep".to_owned()])?;
+    let known = scenario.rig.roles().join(", ");
+    let id = RoleId::named(&scenario, role)
+        .ok_or_else(|| failed(format!("there is no role `{role}`; known here: {known}")))?;
+    Ok(describe_seat(&scenario, id, None).to_json())
 }
 
 /// The domain of the run that is meant by its domain, or by the directory that its results go to; none if there is no such run.

@@ -13,7 +13,7 @@ use std::time::SystemTime;
 /// The number of the signal by which Ctrl-C ends a sweep in order.
 const SIGINT: usize = 2;
 
-/// A campaign by its path, by the name of one that ships, as JSON of its tables, or as text.
+/// A campaign by its path, by the name of one that ships, or as text.
 fn load(given: &str, kind: &str, overrides: &[String]) -> PyResult<Campaign> {
     let base = |name: &str| {
         let found = shipped().into_iter().find(|(known, _)| *known == name);
@@ -23,11 +23,6 @@ fn load(given: &str, kind: &str, overrides: &[String]) -> PyResult<Campaign> {
         })
     };
     match kind {
-        "tables" => {
-            let tables: toml::Table = serde_json::from_str(given).map_err(refused)?;
-            let text = toml::to_string(&tables).map_err(refused)?;
-            Campaign::parse(&text, "the campaign given", overrides, &base)
-        }
         "text" => Campaign::parse(given, "the campaign given", overrides, &base),
         "name" => {
             let named = SHIPPED.iter().find(|(name, _)| *name == given);

@@ -218,6 +218,33 @@ impl Steps {
         &self.inputs
     }
 
+    /// Returns the numbers of the loop's state after [`observe`](Self::observe): those that each role passes to
+    /// [`Persist`](crate::state::Persist), role by role, bodies first. Commands that are in flight are among them, but not the one that
+    /// [`act`](Self::act) sends next.
+    pub fn state(&mut self) -> Vec<(&str, Vec<f64>)> {
+        let scenario = &self.scenario;
+        let numbers = |((role, _), node): (&(RoleId, Ledger), &mut ReadyNode)| {
+            let mut numbers = Vec::new();
+            node.numbers(&mut |number| numbers.push(*number));
+            (role.name(scenario), numbers)
+        };
+        let own = |((role, _), _): &(&(RoleId, Ledger), &mut ReadyNode)| *role != RoleId::Controller;
+        self.seats.iter().zip(&mut self.nodes).filter(own).map(numbers).collect()
+    }
+
+    /// Replaces the numbers of the loop's state, in the order of [`state`](Self::state). Counters, flags, noise generators and the
+    /// memory of guards stay.
+    ///
+    /// # Panics
+    /// If their number differs.
+    pub fn set_state(&mut self, numbers: &[f64]) {
+        let (mut rest, controller) = (numbers.iter(), self.nodes.len() - 1);
+        for node in &mut self.nodes[..controller] {
+            node.numbers(&mut |number| *number = *rest.next().expect("a number for each state"));
+        }
+        assert_eq!(rest.len(), 0, "one number for each state");
+    }
+
     /// Returns the ports of its commands, one for each driven body.
     pub fn outputs(&self) -> &[Port] {
         &self.outputs

@@ -36,6 +36,7 @@ mod seat;
 mod set;
 mod shipped;
 mod signals;
+mod step;
 mod sweep;
 mod tracer;
 mod watch;
@@ -132,6 +133,9 @@ enum Command {
     /// Exchange signals with the other hosts of a run
     #[command(hide = true)]
     Relay(hosts::RelayArguments),
+    /// Step runs for the parent process
+    #[command(hide = true)]
+    Step,
     /// Be the other end of a measured hop
     #[command(hide = true)]
     BenchPeer(bench::PeerArguments),
@@ -294,6 +298,7 @@ fn execute(command: Option<Command>) -> Exit {
         Some(Command::Schema(arguments)) => schema::schema(&arguments),
         Some(Command::Completions(arguments)) => help::completions(&arguments, Arguments::command()),
         Some(Command::Man(arguments)) => help::man(&arguments, Arguments::command()),
+        Some(Command::Step) => step::step(),
         Some(Command::BenchPeer(arguments)) => Ok(bench::peer(&arguments)),
         Some(Command::Tracer(arguments)) => tracer::tracer(&arguments),
         Some(Command::Janitor(arguments)) => Ok(janitor(&arguments)),

@@ -8,7 +8,7 @@ use super::output::{Exit, Failure, exit_of, fail, print, remark};
 use super::perfetto;
 use super::scenario::{Change, changed, load, stem};
 use super::shipped::name;
-use super::signals::catch_signals;
+use super::signals::{catch_signals, die_with};
 use crate::config::{ClockKind, RunId};
 use crate::doctor::{self, Demand, Machine};
 use crate::files;
@@ -89,9 +89,12 @@ pub struct Arguments {
     /// Print the summary as JSON, everything else to stderr
     #[arg(long)]
     json: bool,
-    /// Print events as lines of JSON (corotate/event/v1)
+    /// Print events as lines of JSON (corotate/event/v1); with -q errors and the verdict only there
     #[arg(long, conflicts_with = "json")]
     events: bool,
+    /// Die with this process
+    #[arg(long, value_name = "PID", hide = true)]
+    parent: Option<i32>,
     /// Print only errors and the last line
     #[arg(short, long, conflicts_with = "verbose")]
     quiet: bool,
@@ -244,10 +247,25 @@ impl RunFailure {
     fn new(exit: Exit, error: impl Into<Failure>) -> Self {
         Self { exit, failure: error.into() }
     }
+
+    /// Prints the reason: as an event too, if events are printed; with `--quiet` then only as an event.
+    fn report(self, arguments: &Arguments) -> Exit {
+        let Self { exit, failure } = self;
+        let error = |(text, code): &(String, &str)| serde_json::json!({ "text": text, "code": code });
+        let errors: Vec<_> = failure.0.iter().map(error).collect();
+        let fields = serde_json::json!({ "errors": errors, "exit": exit.code() });
+        match arguments.events.then(|| event("error", fields)) {
+            Some(Ok(())) if arguments.quiet => exit,
+            _ => fail(exit, failure),
+        }
+    }
 }
 
 /// Executes `corotate run`.
 pub fn run(arguments: &Arguments) -> Exit {
+    if let Some(Err(exit)) = arguments.parent.map(die_with) {
+        return exit;
+    }
     let run = match new_run() {
         Ok(run) => run,
         Err(error) => {
@@ -276,7 +294,7 @@ pub fn run(arguments: &Arguments) -> Exit {
             let verdict = Verdict::new(&summary);
             verdict.print(arguments).map_or_else(|error| fail(Exit::Failure, error), |()| verdict.exit)
         }
-        Err(RunFailure { exit, failure }) => fail(exit, failure),
+        Err(failed) => failed.report(arguments),
     };
     match (written, exit) {
         (Err(failure), Exit::Ok) => failure,
@@ -490,6 +508,9 @@ impl Verdict {
         if arguments.events {
             event("verdict", serde_json::json!({ "word": word, "reason": self.reason, "exit": self.exit.code() }))?;
         }
+        if arguments.events && arguments.quiet {
+            return Ok(());
+        }
         if arguments.json || arguments.events {
             tell(format_args!("{}: {}", paint(word, color, &io::stderr()), self.reason));
             return Ok(());
@@ -593,6 +614,11 @@ impl Screen {
             }
             Progress::Waiting { domain, .. } => format!("the run's domain is {}", domain.display()),
             Progress::Running { last_tick, .. } => format!("running ticks 0 to {last_tick}"),
+            Progress::External(words) if self.events => {
+                // As below.
+                let _ = event("notice", serde_json::json!({ "text": words }));
+                return;
+            }
             Progress::External(_) => return,
         };
         if phase != self.last_phase {

@@ -31,6 +31,36 @@ pub trait Words {
     fn weight(&mut self, value: &mut f64) {
         self.number(value);
     }
+
+    /// Visits the words of a sample, of which those are numbers for whose index `is_number` returns true.
+    #[inline]
+    fn sample(&mut self, words: &mut [u64], _is_number: impl Fn(usize) -> bool) {
+        words.iter_mut().for_each(|word| self.word(word));
+    }
+}
+
+/// Passes the numbers among the words of a sample to `visit`, which may change them.
+pub fn each_number(words: &mut [u64], is_number: impl Fn(usize) -> bool, mut visit: impl FnMut(&mut f64)) {
+    for (_, word) in words.iter_mut().enumerate().filter(|(index, _)| is_number(*index)) {
+        let mut value = f64::from_bits(*word);
+        visit(&mut value);
+        *word = value.to_bits();
+    }
+}
+
+/// A visitor of the numbers of a state, which keeps everything else.
+pub struct NumberWords<'a>(pub &'a mut dyn FnMut(&mut f64));
+
+impl Words for NumberWords<'_> {
+    fn word(&mut self, _value: &mut u64) {}
+
+    fn number(&mut self, value: &mut f64) {
+        (self.0)(value);
+    }
+
+    fn sample(&mut self, words: &mut [u64], is_number: impl Fn(usize) -> bool) {
+        each_number(words, is_number, &mut self.0);
+    }
 }
 
 /// A visitor that passes the numbers of a state on as [weights](Words::weight).

@@ -1,62 +1,122 @@
 """A loop as a system of python-control."""
 
+import tempfile
+
 import control
 import numpy as np
 
-from . import _corotate
-from .env import Env
-from .scenario import given, overrides
+from .program import Program
+from .run import run
+from .scenario import given
+from .steps import Steps, session
 
-NOT_LINEAR = "a corotate loop keeps its state to itself, so it cannot be linearised or solved for an equilibrium here; simulate it, or see" \
-    " corotate.certificate for the rate at which its error falls"
-
-
-class _Loop(control.NonlinearIOSystem):
-    """A system that refuses to be linearised."""
-
-    def linearize(self, *arguments, **options):
-        raise NotImplementedError(NOT_LINEAR)
+NOT_KNOWN = "the loop has not been simulated to tick {tick}: simulate it from t = 0 on, or begin there with to_control(…, tick={tick})"
 
 
-def to_control(scenario, *, set={}):
-    """The plants and the observer of a scenario as a discrete `NonlinearIOSystem`: the inputs are the commands, the outputs what the
-    controller observes, named as those of `Env` with a space for each dot. It is the loop's production code, which keeps its state to itself: the system's only
-    state is the tick. So it goes forward only: simulate it from tick 0 on (`control.input_output_response`). `control.linearize` is
-    refused.
+class Loop(control.NonlinearIOSystem):
+    """A loop from a tick on: `x0` is the state there, `u0` the command of that tick."""
+
+
+class _Stepper:
+    """Computes a tick of a loop from any state: counters, flags and noise are those after the commands before it."""
+
+    def __init__(self, program, text, kind, changes):
+        self._begin = lambda: Steps(self._session, text, kind, changes)
+        self._session = session(program)
+        self.steps = self._begin()
+        # The commands of the ticks so far; the next tick; what was computed last.
+        self.commands, self._tick, self._last = [], 0, (None, None, None)
+        self.initial = np.concatenate([self.steps.state(), np.zeros(len(self.steps.action_names))])
+
+    def _advance(self, command):
+        """Runs the next tick, with the command of the one before."""
+        if self._tick == 0:
+            self.steps.observe()
+        else:
+            self.steps.step(command)
+        self._tick += 1
+
+    def _go_to(self, tick):
+        """Runs a loop up to a tick, with the commands before it."""
+        if len(self.commands) < tick:
+            raise NotImplementedError(NOT_KNOWN.format(tick=tick))
+        self.steps, self._tick = self._begin(), 0
+        for command in [None, *self.commands[:max(tick - 1, 0)]][:tick]:
+            self._advance(command)
+
+    def compute(self, tick, state):
+        """Returns observation and state after a tick that begins in a state: the loop's numbers, and the command on its way."""
+        if self._last[0] != (key := (tick, state.tobytes())):
+            numbers, sent = np.split(state, [len(state) - len(self.steps.action_names)])
+            if self._tick != tick or not np.array_equal(numbers, self.steps.state(), equal_nan=True):
+                self._go_to(tick)
+                self.steps.set_state(numbers)
+            self._advance(sent)
+            self._last = key, self.steps.observation, self.steps.state()
+        return self._last[1:]
+
+
+def to_control(scenario, *, program=None, set={}, tick=0):
+    """The bodies and the observer of a scenario, from a tick on, as a discrete `NonlinearIOSystem`.
+
+    The inputs are the first field of each command, the outputs what the controller observes, named as those of `Env` with a space for
+    each dot. It is the loop's production code. Its states are the loop's own numbers, in the order in which the roles keep them, as
+    `leader[0]`, and the command that is on its way to the bodies. To `tick` the loop is run with the scenario's controller: `x0` is the
+    state there, `u0` the command of that tick. So `control.linearize(system, system.x0, system.u0)` is the loop at that tick. Time 0 of
+    the system is that tick, and a later time is computed for loops that were simulated to it (`control.input_output_response`).
+
+    Counters, flags, the memory of guards, and noise are no states: they are those of the loop at that tick. Where samples have noise,
+    it is the same for every state, so that a linearisation is that of the loop without noise. Quantisation has no derivative.
     """
-    text, changes = given(scenario), overrides({"accept": {}, **set, "clock": "in-process"})
-    env, tick_s = Env(scenario, set=set), _corotate.describe(*text, "controller")[2]
-    steps, seen, held = None, [], []
+    text, kind = given(scenario)
+    changes = {"accept": {}, **set, "clock": "in-process"}
+    stepper = _Stepper(None if program is None else Program(program), text, kind, changes)
+    steps, tick_s = stepper.steps, stepper.steps.tick_s
+    u0 = np.zeros(len(steps.action_names))
+    x0 = stepper.initial
+    if tick:
+        stepper.commands = _commands(scenario, program, changes, steps, tick)
+        stepper._go_to(tick)
+        x0, u0 = np.concatenate([stepper.steps.state(), stepper.commands[tick - 1]]), stepper.commands[tick]
+    # A number that is not finite is unused so far: no state.
+    used = np.isfinite(x0)
 
-    def begin():
-        nonlocal steps
-        steps = _corotate.Steps(*text, changes)
-        seen[:], held[:] = [steps.observation()], []
+    def at(time, state):
+        full = x0.copy()
+        full[used] = state
+        return tick + round(time / tick_s), full
 
-    def tick_of(state):
-        tick = round(float(state[0]))
-        if abs(state[0] - tick) > 1e-9 or not 0 <= tick <= len(held):
-            raise NotImplementedError(NOT_LINEAR)
-        return tick
+    def update(time, state, command, params):
+        now, full = at(time, state)
+        after = stepper.compute(now, full)[1]
+        stepper.commands[now:] = [np.array(command, dtype=float)]
+        return np.concatenate([after, command])[used]
 
-    def update(time, state, commands, params):
-        tick = tick_of(state)
-        if tick == 0:
-            begin()
-        if len(seen) <= tick + 1:
-            held[tick:] = [np.array(commands, dtype=float)]
-        elif not np.array_equal(held[tick], commands, equal_nan=True):
-            raise NotImplementedError(NOT_LINEAR)
-        return [tick + 1]
+    def outputs(time, state, command, params):
+        return stepper.compute(*at(time, state))[0]
 
-    def outputs(time, state, commands, params):
-        tick = tick_of(state)
-        while len(seen) <= tick:
-            seen.append(steps.step(held[len(seen) - 1])[0])
-        return seen[tick]
-
-    begin()
     # No dot may be in a name there.
-    inputs, outs = ([name.replace(".", " ") for name in names] for names in (env.action_names, env.observation_names))
+    inputs, outs = ([name.replace(".", " ") for name in names] for names in (steps.action_names, steps.observation_names))
+    states = [name for name, there in zip(steps.state_names + [f"sent {name}" for name in inputs], used) if there]
     name = "corotate" if isinstance(scenario, dict) else str(scenario).replace(".", " ")
-    return _Loop(update, outputs, inputs=inputs, outputs=outs, states=["tick"], dt=tick_s, name=name)
+    system = Loop(update, outputs, inputs=inputs, outputs=outs, states=states, dt=tick_s, name=name)
+    system.x0, system.u0 = x0[used], u0
+    return system
+
+
+def _commands(scenario, program, changes, steps, tick):
+    """Returns the commands of the scenario's controller, tick by tick, up to a tick; zero where it sent none."""
+    with tempfile.TemporaryDirectory() as directory:
+        until = {**changes, "duration_s": min(changes.get("duration_s", np.inf), (tick + 1) * steps.tick_s)}
+        recording = run(scenario, program=program, clock="in-process", set=until, record=True, out=directory, overwrite=True).recording
+        columns, found = [], np.zeros((tick + 1, len(steps.action_names)))
+        for body, signal, dtype in steps.samples.writes:
+            name = f"{body}/{signal}"
+            values = recording.array(f"{name}.{dtype.names[0]}").reshape(len(recording.ticks(name)), -1)
+            columns.append((recording.ticks(name), values))
+    at = 0
+    for ticks, values in columns:
+        early = ticks <= tick
+        found[ticks[early].astype(int), at:at + values.shape[1]] = values[early]
+        at += values.shape[1]
+    return list(found)

@@ -1,13 +1,12 @@
 """A loop as an environment of gymnasium: the caller is the controller."""
 
-import json
-
 import gymnasium
 import numpy as np
 
 from . import _corotate
-from .scenario import given, overrides, seed_of, toml
-from .seat import Samples
+from .program import Program
+from .scenario import given, seed_of, toml
+from .steps import Steps, session
 
 # Limits from the guards, by the beginning of a field's name: of measurements, of estimates, of commands that act.
 RATES, APPLIED = ("omega_", "velocity_"), "applied_"
@@ -26,19 +25,18 @@ class Env(gymnasium.Env):
     commands that were due then were `rejected` by the guards and `missed` (absent, late or rejected; the body holds the last one or is
     safe). The step into the truncation has no tick after it, and none of these.
 
-    A copied or pickled environment has the settings and the random generator, and no episode: `reset` begins one.
+    A copied or pickled environment has the settings and the random generator, and no episode: `reset` begins one. With `program` the
+    scenario is one of a program built on corotate, which steps it in a process of its own until `close`.
     """
 
     metadata = {"render_modes": []}
 
-    def __init__(self, scenario="rigid-pair", *, set={}, action_bound=None, normalize_actions=False):
-        self._given, self._changes = given(scenario), dict(set)
+    def __init__(self, scenario="rigid-pair", *, program=None, set={}, action_bound=None, normalize_actions=False):
+        self._given, self._program, self._changes = given(scenario), None if program is None else Program(program), dict(set)
+        self._session = None
         steps = self._begin({})
-        samples = Samples(*steps.seat())
-        self.observation_names = [f"{body}/{signal}.{name}" for body, signal, dtype in samples.reads for name in self._numbers(dtype)]
-        firsts = [(body, signal, dtype.names[0], int(np.prod(dtype[0].shape))) for body, signal, dtype in samples.writes]
-        self.action_names = [f"{body}/{signal}.{name}[{index}]" for body, signal, name, count in firsts for index in range(count)]
-        bounds = [bound for _, bound in steps.limits()] or [np.inf] * 3
+        self.observation_names, self.action_names = steps.observation_names, steps.action_names
+        bounds = [bound for _, bound in steps.limits] or [np.inf] * 3
         bound = bounds[-1] if action_bound is None else float(action_bound)
         if normalize_actions and not np.isfinite(bound):
             raise ValueError("normalize_actions=True: the scenario does not bound its commands; give action_bound")
@@ -50,13 +48,6 @@ class Env(gymnasium.Env):
         self._seeded = self._over = False
 
     @staticmethod
-    def _numbers(dtype):
-        for name in dtype.names:
-            base, shape = dtype[name].subdtype or (dtype[name], ())
-            if base == np.float64:
-                yield from [f"{name}[{index}]" for index in range(shape[0])] if shape else [name]
-
-    @staticmethod
     def _bound(name, bounds):
         signal, field = name.split("/")[1].split(".", 1)
         if field.startswith(APPLIED):
@@ -64,19 +55,27 @@ class Env(gymnasium.Env):
         return bounds[signal == "estimate"] if field.startswith(RATES) else np.inf
 
     def _begin(self, more):
-        changes = {**self._changes, "clock": "in-process", **more}
+        changes = {**self._changes, **more}
+        if self._session is None:
+            self._session = session(self._program)
         try:
-            return _corotate.Steps(*self._given, overrides(changes))
+            return Steps(self._session, *self._given, changes).observe()
         except ValueError as error:
             refused = error
         # The criteria may need a longer run than is asked for.
         try:
-            return _corotate.Steps(*self._given, overrides({"accept": {}, **changes}))
+            return Steps(self._session, *self._given, {"accept": {}, **changes}).observe()
         except ValueError:
             raise refused from None
 
     def __getstate__(self):
-        return {**self.__dict__, "_steps": None, "_summary": None}
+        return {**self.__dict__, "_session": None, "_steps": None, "_summary": None}
+
+    def close(self):
+        """Ends the episode, and the process of a program; `reset` begins another."""
+        if self._session is not None:
+            self._session.close()
+        self._session = self._steps = self._summary = None
 
     def reset(self, *, seed=None, options=None):
         """Begins an episode. `seed` is the scenario's, of all noise; without one it is drawn from `np_random`, so that every episode has
@@ -88,8 +87,9 @@ class Env(gymnasium.Env):
         super().reset(seed=seed)
         self._seeded = True
         seed = int(self.np_random.integers(2**63)) if seed is None else seed
-        self._steps, self._summary, self._over = self._begin({"seed": seed}), None, False
-        return self._steps.observation(), {"seed": seed}
+        self._steps = self._summary = None
+        self._steps, self._over = self._begin({"seed": seed}), False
+        return self._steps.observation, {"seed": seed}
 
     def step(self, action):
         """Acts for one tick. An action that is not finite, or out of bounds, is given to the loop as it is: see `rejected`."""
@@ -97,17 +97,16 @@ class Env(gymnasium.Env):
             raise RuntimeError("there is no episode: call reset() first")
         if self._over:
             raise _corotate.CorotateError("the episode is over: call reset() to begin another")
-        action = np.ascontiguousarray(action, dtype=np.float64) * self._scale
-        observation, metric, truncated, acted = self._steps.step(action)
-        if acted is None:
+        steps = self._steps
+        steps.step(np.asarray(action, dtype=np.float64) * self._scale)
+        if steps.over:
             self._over = True
-            return observation, -metric, False, True, {}
-        applied, rejected, missed, reason = acted
-        info = {"applied": applied / self._scale, "rejected": rejected, "missed": missed}
-        if reason is not None:
+            return steps.observation, -steps.metric, False, True, {}
+        info = {"applied": steps.applied / self._scale, "rejected": steps.rejected, "missed": steps.missed}
+        if steps.loss is not None:
             self._over = True
-            info["reason"] = reason
-        return observation, -metric, self._over, False, info
+            info["reason"] = steps.loss
+        return steps.observation, -steps.metric, self._over, False, info
 
     def set_input(self, key, value):
         """Changes an input of the episode, such as a disturbance or a set point, and returns the tick from which it acts: the next one.
@@ -126,5 +125,5 @@ class Env(gymnasium.Env):
         if self._summary is None:
             if self._steps is None:
                 raise RuntimeError("there is no episode to sum up: call reset() first")
-            self._summary, self._steps = json.loads(self._steps.finish()[0]), None
+            self._summary, self._steps = self._steps.finish()[0], None
         return self._summary

@@ -1,6 +1,8 @@
 """Runs."""
 
+import contextlib
 import contextvars
+import functools
 import json
 import logging
 import threading
@@ -9,10 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import _corotate
+from .program import Program
 from .recording import Recording
-from .scenario import given, overrides
 from .roles import RoleProcess, RoleThread, end_thread
-from .seat import Samples
+from .scenario import given, overrides
+from .steps import Steps, session
 
 LOG = logging.getLogger("corotate")
 CLOCKS = ("in-process", "lockstep", "realtime")
@@ -97,7 +100,7 @@ class _Timeout:
             raise TimeoutError(f"the run took longer than {self.timeout_s} s{at}")
 
 
-def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", record=False, out=None, timeout_s=None,
+def run(scenario, *, program=None, clock="lockstep", set={}, roles={}, roles_in="thread", record=False, out=None, timeout_s=None,
         require_realtime=False, overwrite=False):
     """Runs a scenario to its end.
 
@@ -105,6 +108,8 @@ def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", reco
     ----------
     scenario : str, path or dict
         The name of one that ships (`corotate.shipped()`), a file, or its tables.
+    program : path
+        A program built on corotate, with rigs and shipped scenarios of its own; this package otherwise.
     clock : "lockstep", "realtime" or "in-process"
         What drives the ticks; the bits are the same under each, until the first missed tick.
     set : dict
@@ -150,19 +155,20 @@ def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", reco
     # Where pytest shows a frame it shows the docstring too.
     __tracebackhide__ = True
     text, kind = given(scenario)
-    timeout = _Timeout(timeout_s)
+    timeout, program = _Timeout(timeout_s), None if program is None else Program(program)
     if roles and clock == "in-process":
         if list(roles) != ["controller"]:
             raise ValueError("in one thread a function can only be the controller; take clock='lockstep'")
         if record:
             raise ValueError("a run that is stepped is not recorded; take clock='lockstep'")
-        return _stepped(text, kind, set, roles["controller"], timeout, out, overwrite)
+        begin = functools.partial(Steps, text=text, kind=kind, changes={"clock": clock, **set}, keep=True, out=out, overwrite=overwrite)
+        return _stepped(program, begin, roles["controller"], timeout)
     start = RoleThread if roles_in == "thread" else RoleProcess
     arguments = text, kind, overrides({"clock": clock, **set}), list(roles), record, out and str(out), overwrite, require_realtime
-    return _launched(arguments, roles, start, timeout)
+    return _launched(_corotate.run if program is None else program.run, arguments, roles, start, timeout)
 
 
-def _launched(arguments, roles, start, timeout):
+def _launched(launch, arguments, roles, start, timeout):
     """A run in processes, with functions in the seats of some roles."""
     __tracebackhide__ = True
     helpers, wait_s = {}, 0.1
@@ -181,7 +187,7 @@ def _launched(arguments, roles, start, timeout):
 
     made, ended, lost = None, None, []
     try:
-        summary, directory = _corotate.run(*arguments, tell)
+        summary, directory = launch(*arguments, tell)
         made = Run(json.loads(summary), Path(directory))
         lost = [incident for incident in made.summary["incidents"] if incident["action"] == "stopped"]
         # A role that hangs does not end; one that raised needs a moment to tell of it.
@@ -212,23 +218,21 @@ def _with_run(error, made, role=None):
     return error
 
 
-def _stepped(text, kind, changes, function, timeout, out, overwrite):
+def _stepped(program, begin, function, timeout):
     """A run in one thread whose controller is a function. With a limit of time this thread watches another one."""
     __tracebackhide__ = True
     made, errors, left = [], [], threading.Event()
 
     def step():
-        steps = _corotate.Steps(text, kind, overrides({**changes, "clock": "in-process"}))
-        steps.claim(out and str(out), overwrite)
-        samples = Samples(*steps.seat())
-        blank = samples.blank()
-        while not steps.over() and not left.is_set():
-            inputs, outputs = samples.inputs(steps.inputs()), samples.outputs(blank)
-            function(steps.tick(), inputs, outputs)
-            steps.act(outputs.close())
-        if not left.is_set():
-            summary, directory = steps.finish()
-            made.append(Run(json.loads(summary), Path(directory)))
+        with contextlib.closing(session(program)) as opened:
+            steps = begin(opened).observe()
+            while not steps.over and not left.is_set():
+                outputs = steps.outputs()
+                function(steps.tick, steps.inputs(), outputs)
+                steps.act(outputs.close())
+            if not left.is_set():
+                summary, directory = steps.finish()
+                made.append(Run(summary, Path(directory)))
 
     def guarded():
         try:

@@ -6,9 +6,9 @@ import os
 
 
 def given(scenario):
-    """A scenario as the extension takes it: a text, and what it is."""
+    """A scenario as programs take it: a text, and its kind: the path of a file, the name of a shipped one, or TOML."""
     if isinstance(scenario, dict):
-        return json.dumps(scenario), "tables"
+        return "".join(f"{json.dumps(str(key))} = {toml(value)}\n" for key, value in scenario.items()), "text"
     path = os.fspath(scenario)
     is_path = not isinstance(scenario, str) or "/" in path or path.endswith(".toml")
     return path, "path" if is_path else "name"

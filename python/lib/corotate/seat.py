@@ -4,13 +4,28 @@ A sample has its fields as attributes; each is an array of float64 or uint64. An
 belongs to its tick: to write to it afterwards is an error.
 """
 
+import contextlib
+import json
 import os
+import socket
+import struct
+import subprocess
+import sys
 import time
+import traceback
 
 import numpy as np
 
 from . import _corotate
+from .program import Program
 from .scenario import given
+
+
+# The number of fields of a stamp, which is at the begin of every sample; each has eight bytes.
+STAMP_FIELDS = 4
+# Kinds of frames to and from a process that serves a seat, and limits of their lengths, bytes.
+TICK, END, OUTPUTS, FAILURE = 3, 4, 1, 2
+FRAME_BYTES, TEXT_BYTES = 1 << 18, 32 << 10
 
 
 class Sample:
@@ -73,21 +88,20 @@ class Group:
         return [sample._array.tobytes() for sample in self]
 
 
-def _dtype(fields):
-    names, formats, offsets = [], [], []
-    for name, kind, count, offset in fields:
-        names.append(name)
-        formats.append(f"={kind}" if count == 1 else (f"={kind}", (count,)))
-        offsets.append(offset)
-    return np.dtype({"names": names, "formats": formats, "offsets": offsets})
+def _layout(signal):
+    """Returns body, signal and layout without the stamp of a signal in a seat."""
+    fields = signal["fields"][STAMP_FIELDS:]
+    formats = [f"={field['kind'][0]}8" if field["count"] == 1 else (f"={field['kind'][0]}8", (field["count"],)) for field in fields]
+    dtype = np.dtype({"names": [field["name"] for field in fields], "formats": formats,
+                      "offsets": [field["offset"] - 8 * STAMP_FIELDS for field in fields]})
+    return signal["service"].split("/")[-2], signal["signal"], dtype
 
 
 class Samples:
-    """The layouts of what a role reads and writes."""
+    """The layouts of what a role reads and writes, from its seat."""
 
-    def __init__(self, reads, writes):
-        self.reads = [(body, signal, _dtype(fields)) for body, signal, fields in reads]
-        self.writes = [(body, signal, _dtype(fields)) for body, signal, fields in writes]
+    def __init__(self, seat):
+        self.reads, self.writes = ([_layout(signal) for signal in seat[key]] for key in ("reads", "writes"))
 
     def inputs(self, given):
         """What was read: None where a sample is missing."""
@@ -111,7 +125,8 @@ def serve(domain, role, function):
     """
     __tracebackhide__ = True
     domain = _domain(domain)
-    samples = Samples(*_corotate.describe(domain, "domain", role)[:2])
+    seat = _seat(domain, role)
+    samples = Samples(seat)
 
     def tick(number, inputs, blank):
         __tracebackhide__ = True
@@ -119,7 +134,16 @@ def serve(domain, role, function):
         function(number, samples.inputs(inputs), outputs)
         return outputs.close()
 
-    _corotate.serve(domain, role, tick)
+    if not _is_foreign(seat):
+        return _corotate.serve(domain, role, tick)
+    with contextlib.closing(SeatProcess(seat, domain, role, samples)) as process:
+        answer = None
+        while (asked := process.next(answer)) is not None:
+            try:
+                answer = tick(*asked)
+            except BaseException:
+                process.fail(traceback.format_exc().rstrip())
+                raise
 
 
 def _domain(path, wait_s=10.0):
@@ -146,11 +170,14 @@ class Seat:
 
     def __init__(self, run, role):
         self._domain_path = _domain(run)
-        reads, writes, self.tick_s = _corotate.describe(self._domain_path, "domain", role)
-        self._samples, self.role = Samples(reads, writes), role
+        self._description = seat = _seat(self._domain_path, role)
+        self._samples, self.role, self.tick_s = Samples(seat), role, seat["period_ns"] * 1e-9
 
     def __iter__(self):
-        ticks = _corotate.Ticks(self._domain_path, self.role)
+        if _is_foreign(self._description):
+            ticks = SeatProcess(self._description, self._domain_path, self.role, self._samples)
+        else:
+            ticks = _corotate.Ticks(self._domain_path, self.role)
         answer = None
         try:
             while (asked := ticks.next(answer)) is not None:
@@ -162,11 +189,101 @@ class Seat:
             ticks.close()
 
 
-def layout(scenario, role):
-    """What a role of a scenario reads and writes: two lists of (body, signal, numpy dtype).
+def _is_foreign(seat):
+    """Returns true if the run is that of another program, whose rigs only that program knows."""
+    return seat.get("program") is not None and seat["program"] != [sys.executable, "-m", "corotate"]
+
+
+def _seat(domain, role):
+    """Returns the seat of a role for which the run in a domain waits."""
+    try:
+        with open(os.path.join(domain, f"{role}.seat.json"), encoding="utf-8") as file:
+            return json.load(file)
+    except FileNotFoundError:
+        error = f"the run in {domain} does not wait for {role}: start it with --external {role}"
+        raise _corotate.CorotateError(error) from None
+
+
+def _all_valid(dtype):
+    """Returns a sample of zeros whose `valid` has the bits of all components, as bytes."""
+    blank = np.zeros(1, dtype)
+    if "valid" in dtype.names:
+        blank["valid"] = 2**int(np.prod(dtype[0].shape)) - 1
+    return blank.tobytes()
+
+
+class SeatProcess:
+    """A role in a process of the run's own program, which asks this one for every tick; see `crates/runtime/src/seat/server.rs`."""
+
+    def __init__(self, seat, domain, role, samples):
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._reads = [dtype.itemsize for _, _, dtype in samples.reads]
+        self._blank, self._tick = [_all_valid(dtype) for _, _, dtype in samples.writes], None
+        with theirs:
+            command = [*seat["program"], "serve-seat", domain, role, "--fd", str(theirs.fileno())]
+            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=2, pass_fds=[theirs.fileno()], start_new_session=True)
+
+    def next(self, outputs):
+        """Gives the outputs of the tick before, if there was one, and waits for the next: its number, inputs and blank outputs. None
+        at the end of the run.
+        """
+        if outputs is not None:
+            self._send(struct.pack("=QQ", OUTPUTS, self._tick) + b"".join(outputs))
+        while True:
+            frame = self._socket.recv(FRAME_BYTES)
+            kind = struct.unpack_from("=Q", frame)[0] if frame else None
+            if kind == TICK:
+                return self._asked(frame)
+            if kind == END:
+                return self._ended(frame[8:].decode())
+            if kind is None:
+                self.close()
+                raise _corotate.CorotateError(f"the process that serves the seat ended with exit code {self._process.returncode}")
+
+    def _asked(self, frame):
+        self._tick = struct.unpack_from("=Q", frame, 8)[0]
+        present, inputs, at = struct.unpack_from("=Q", frame, 16)[0], [], 24
+        for index, size in enumerate(self._reads):
+            inputs.append(frame[at:at + size] if present >> index & 1 else None)
+            at += size
+        return self._tick, inputs, self._blank
+
+    def _ended(self, text):
+        self.close()
+        if not text:
+            return None
+        code, _, reason = text.partition("\n")
+        error = _corotate.CorotateError(reason)
+        error.code = code
+        raise error
+
+    def fail(self, text):
+        """Ends the role, and with it the run, for a reason."""
+        self._send(struct.pack("=QQ", FAILURE, self._tick) + text.encode()[-TEXT_BYTES:])
+
+    def _send(self, frame):
+        try:
+            self._socket.send(frame)
+        except OSError:
+            pass  # The process has ended: its last frame has the reason.
+
+    def close(self):
+        """Leaves the seat."""
+        self._socket.close()
+        try:
+            self._process.wait(5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def layout(scenario, role, *, program=None):
+    """What a role of a scenario reads and writes: two lists of (body, signal, numpy dtype). The scenario is one of `program`, if
+    that is given.
 
     >>> corotate.seat.layout("rigid-pair", "controller")[1][0][:2]
     ('follower', 'command')
     """
-    samples = Samples(*_corotate.describe(*given(scenario), role)[:2])
+    seat = _corotate.seat if program is None else Program(program).seat
+    samples = Samples(json.loads(seat(*given(scenario), role)))
     return samples.reads, samples.writes

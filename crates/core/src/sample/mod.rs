@@ -26,8 +26,6 @@ pub use order::{Order, Place};
 pub use rigid::{RateCommand, RateEstimate, RateMeasurement, RateTruth};
 pub use run::{Health, InputChange, Phase, RoleState, Schedule};
 
-use crate::state::Words;
-
 /// The header of every sample.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
@@ -173,6 +171,12 @@ pub const fn content_length<S: Sample>() -> usize {
     size_of::<S>() - size_of::<Stamp>()
 }
 
+/// Returns true if a word of a sample, counted from the begin of its stamp, is part of a field of `f64`.
+pub fn is_number(fields: &[Field], word: usize) -> bool {
+    let covers = |field: &&Field| (field.offset / 8..field.offset / 8 + field.count).contains(&word);
+    fields.iter().find(covers).is_some_and(|field| field.kind == FieldKind::F64)
+}
+
 /// Copies every field of `from` into the field of `to` with the same name, type and length, if there is one. The
 /// stamps stay.
 pub fn copy_fields<A: Sample, B: Sample>(from: &A, to: &mut B) {
@@ -184,25 +188,6 @@ pub fn copy_fields<A: Sample, B: Sample>(from: &A, to: &mut B) {
         if let Some(matching) = B::FIELDS.iter().find(same) {
             let length = 8 * field.count;
             target[matching.offset..][..length].copy_from_slice(&source[field.offset..][..length]);
-        }
-    }
-}
-
-/// Passes the words of a sample through `words`, its numbers as such.
-#[inline]
-pub fn persist<S: Sample, W: Words>(sample: &mut S, words: &mut W) {
-    let own = sample.words_mut();
-    own[..size_of::<Stamp>() / 8].iter_mut().for_each(|word| words.word(word));
-    for field in S::FIELDS {
-        for word in &mut own[field.offset / 8..][..field.count] {
-            match field.kind {
-                FieldKind::U64 => words.word(word),
-                FieldKind::F64 => {
-                    let mut number = f64::from_bits(*word);
-                    words.number(&mut number);
-                    *word = number.to_bits();
-                }
-            }
         }
     }
 }
@@ -254,7 +239,8 @@ macro_rules! sample {
         impl $crate::state::Persist for $name {
             #[inline]
             fn persist<W: $crate::state::Words>(&mut self, words: &mut W) {
-                $crate::sample::persist(self, words);
+                let is_number = |word| $crate::sample::is_number(<Self as $crate::sample::Sample>::FIELDS, word);
+                words.sample($crate::sample::Message::words_mut(self), is_number);
             }
         }
 

@@ -8,7 +8,7 @@ use crate::role::{
     Actuation, Guard, LoopBody, LoopControl, Observer, Rearm, SUSPECT_SAMPLES, command_index, cycle, respond,
 };
 use crate::sample::{Field, FieldKind, Message, Sample, Stamp};
-use crate::state::{Persist, Words};
+use crate::state::{Persist, Words, each_number};
 
 /// The loop of a rig's observed body and one driven one, which may be the same, or of all its bodies.
 pub(super) struct Chain<R: Rig> {
@@ -233,6 +233,10 @@ impl Words for Numbers {
     fn number(&mut self, value: &mut f64) {
         self.0.push(*value);
     }
+
+    fn sample(&mut self, words: &mut [u64], is_number: impl Fn(usize) -> bool) {
+        each_number(words, is_number, |value| self.number(value));
+    }
 }
 
 /// Moves the numbers of a state; counters and flags stay.
@@ -259,6 +263,10 @@ impl Words for Stretch<'_> {
         let Some((from, away)) = self.next() else { return };
         let moved = from + self.factor * (*value - from - away);
         *value = if moved.is_finite() { moved } else { from };
+    }
+
+    fn sample(&mut self, words: &mut [u64], is_number: impl Fn(usize) -> bool) {
+        each_number(words, is_number, |value| self.number(value));
     }
 
     /// Resets a weight to that of the reference. Without an error, weights have no effect: a small difference in them is not part

@@ -50,6 +50,13 @@ impl<C> DelayLine<C> {
         self.next.max(self.due_at(tick).unwrap_or(0))
     }
 
+    /// Returns the places of the commands that are applied after the latest tick, the oldest first.
+    pub fn in_flight_mut(&mut self) -> impl Iterator<Item = &mut C> {
+        let oldest = (self.next % self.places.len() as u64) as usize;
+        let (newer, older) = self.places.split_at_mut(oldest);
+        older.iter_mut().chain(newer).skip(1).map(|place| &mut place.command)
+    }
+
     fn place(&mut self, tick: u64) -> &mut Place<C> {
         self.next = tick + 1;
         let at = (tick % self.places.len() as u64) as usize;

@@ -19,7 +19,7 @@ impl RoleId {
         match user {
             InputUser::Body(index) | InputUser::Actuator(index) => Some(Self::Plant(index)),
             InputUser::Observer => Some(Self::Observer),
-            InputUser::Law(_) => Some(Self::Controller),
+            InputUser::Law(_) | InputUser::Reference => Some(Self::Controller),
             InputUser::Score => None,
         }
     }

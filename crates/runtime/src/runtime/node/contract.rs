@@ -100,6 +100,8 @@ pub trait Node {
     fn stages(&self) -> Vec<StageReport>;
     /// Returns the length of the node's state, words.
     fn state_words(&mut self) -> usize;
+    /// Passes every number of the role's own state, in an order that does not change: not the counters, nor the state of its links.
+    fn numbers(&mut self, _visit: &mut dyn FnMut(&mut f64)) {}
     /// Returns the node of a role if several roles are driven as one.
     fn member(&self, _role: RoleId) -> Option<&dyn Node> {
         None

@@ -18,7 +18,7 @@ use crate::runtime::role_inputs::RoleInputs;
 use crate::runtime::sample_source::{Progress, SampleSource};
 use crate::sample::Message;
 use crate::serial::LineCounters;
-use crate::state::{Persist, Words};
+use crate::state::{NumberWords, Persist, Words};
 use crate::telemetry::{LateRecord, LateTicks, Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
 
 /// The instants of one executed tick, ns.
@@ -264,6 +264,10 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
 
     fn state_words(&mut self) -> usize {
         length(self)
+    }
+
+    fn numbers(&mut self, visit: &mut dyn FnMut(&mut f64)) {
+        self.observer.persist(&mut NumberWords(visit));
     }
 
     fn ticks(&self) -> Ticks {

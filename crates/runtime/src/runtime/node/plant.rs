@@ -15,8 +15,8 @@ use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::runtime::role_function::FunctionRole;
 use crate::runtime::role_id::RoleId;
 use crate::runtime::role_inputs::{NewValue, RoleInputs};
-use crate::sample::{Message, Stamp};
-use crate::state::{Persist, Words};
+use crate::sample::{Field, Message, Stamp, is_number};
+use crate::state::{NumberWords, Persist, Words};
 use crate::telemetry::{LateRecord, LateTicks, Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
 use std::borrow::{Borrow, BorrowMut};
 
@@ -31,6 +31,7 @@ pub struct PlantNode<P: LinkedBody, G, B: Bus> {
     command: Option<Input<B, P::Command, G>>,
     /// Commands that have arrived and are not due, with an actuation delay above one tick.
     line: Option<DelayLine<<P::Command as Carried>::Owned>>,
+    command_fields: Vec<Field>,
     measurement: Output<B, P::Measurement>,
     truth: Output<B, P::Truth>,
     clock: Clock,
@@ -77,6 +78,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             plant: Plant::new(body, scenario.actuation(info.driven), scenario.tick_s()),
             command,
             line,
+            command_fields: P::Command::fields(bodies),
             measurement,
             truth,
             clock: context.clock,
@@ -422,6 +424,14 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P
 
     fn state_words(&mut self) -> usize {
         length(self)
+    }
+
+    fn numbers(&mut self, visit: &mut dyn FnMut(&mut f64)) {
+        let mut numbers = NumberWords(visit);
+        self.plant.persist(&mut numbers);
+        let fields = &self.command_fields;
+        let in_flight = self.line.iter_mut().flat_map(DelayLine::in_flight_mut);
+        in_flight.for_each(|command| numbers.sample(command.borrow_mut().words_mut(), |word| is_number(fields, word)));
     }
 
     fn ticks(&self) -> Ticks {
