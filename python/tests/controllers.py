@@ -24,8 +24,8 @@ class Unpicklable(Exception):
 class Fails:
     """A controller that fails in the given way at a tick, or at the next one if that is missed."""
 
-    def __init__(self, how, tick, marker=None):
-        self.how, self.tick, self.marker = how, tick, marker
+    def __init__(self, how, tick, marker=None, role="controller"):
+        self.how, self.tick, self.marker, self.role = how, tick, marker, role
 
     def __call__(self, tick, inputs, outputs):
         if tick < self.tick:
@@ -39,7 +39,8 @@ class Fails:
         outputs.comand
 
     def shape(self, outputs):
-        outputs.command.acceleration_rad_s2 = [1, 2]
+        sample = {"controller": "command", "observer": "estimate"}.get(self.role, "measurement")
+        setattr(outputs[sample], "acceleration_rad_s2" if self.role == "controller" else "omega_rad_s", [1, 2])
 
     def interrupt(self, outputs):
         raise KeyboardInterrupt

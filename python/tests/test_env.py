@@ -68,7 +68,7 @@ def test_python_control_simulates_a_loop():
     system = corotate.to_control("rigid-pair", set={"duration_s": 1})
     assert system.dt == 1e-3 and system.ninputs == 3
     times = np.arange(200) * system.dt
-    response = control.input_output_response(system, times, np.zeros((3, 200)))
+    response = control.input_output_response(system, times, np.zeros((3, 200)), system.x0)
     env = corotate.Env("rigid-pair", set={"duration_s": 1})
     seen = [env.reset()[0]] + [env.step(np.zeros(3))[0] for _ in range(199)]
     assert np.allclose(response.outputs.T, seen)
@@ -218,17 +218,29 @@ def test_the_summary_of_an_episode_has_the_scenario_s_criteria():
     assert unfinished["accepted"] is None and unfinished["books"]["balanced"] and len(unfinished["criteria"]) > 1
 
 
-def test_python_control_does_not_linearise_a_loop():
+def test_a_loop_can_be_part_of_a_larger_system():
     control = pytest.importorskip("control")
     system = corotate.to_control("rigid-pair", set={"duration_s": 1})
-    for state in (np.zeros(0), np.zeros(1)):
-        with pytest.raises(NotImplementedError, match="certificate"):
-            control.linearize(system, state, np.zeros(3))
     gain = control.ss([], [], [], np.eye(3), dt=system.dt, inputs=["a", "b", "c"], outputs=system.input_labels)
     both = control.interconnect([gain, system], inputs=["a", "b", "c"], outputs=system.output_labels)
-    with pytest.raises(NotImplementedError, match="certificate"):
-        control.linearize(both, np.zeros(1), np.zeros(3))
     times = np.arange(50) * system.dt
     commands = np.ones((3, 50))
-    together = control.input_output_response(both, times, commands).outputs
-    assert np.array_equal(together, control.input_output_response(system, times, commands).outputs)
+    together = control.input_output_response(both, times, commands, system.x0).outputs
+    assert np.array_equal(together, control.input_output_response(system, times, commands, system.x0).outputs)
+
+
+def test_an_environment_may_be_used_and_dropped_by_another_thread():
+    import threading
+    env = corotate.Env("rigid-pair", set={"duration_s": 0.1})
+    env.reset()
+    seen = []
+
+    def use(held):
+        seen.append(held.pop().step(np.zeros(3))[0])
+
+    held = [env]
+    del env
+    thread = threading.Thread(target=use, args=(held,))
+    thread.start()
+    thread.join()
+    assert len(seen) == 1 and not held

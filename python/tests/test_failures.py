@@ -52,6 +52,21 @@ def test_an_exception_of_a_role_ends_the_run_and_reaches_the_caller(tmp_path, cl
     assert incident["tick"] == int(raised_at) if clock == "lockstep" else incident["tick"] <= int(raised_at)
 
 
+@EVERYWHERE
+@pytest.mark.parametrize("role", ["controller", "observer", "follower"])
+@pytest.mark.parametrize("tick", [0, 1, 50, 99])
+def test_an_exception_at_any_tick_of_any_role_is_raised_soon(tmp_path, clock, where, role, tick):
+    if clock == "in-process" and role != "controller":
+        pytest.skip("in one thread a function can only be the controller")
+    with pytest.raises(ValueError) as caught:
+        corotate.run("rigid-pair", clock=clock, set={**ENDLESS, "duration_s": 1, "limits": {}}, roles={role: Fails("shape", tick, tmp_path / "at", role)},
+                     roles_in=where, out=tmp_path / "run")
+    took_s = time.time() - float((tmp_path / "at").read_text().split()[1])
+    # 0.2 s on an idle machine, 1.1 s with two spinning programs per core; the launcher's timeouts are longer.
+    assert took_s < 2, took_s
+    assert "in shape" in lines(caught.value)
+
+
 @pytest.mark.parametrize("where", ["thread", "process"])
 @pytest.mark.parametrize("how, raises", [("interrupt", KeyboardInterrupt), ("leave", SystemExit), ("unpicklable", Unpicklable)])
 def test_exit_interrupt_and_unpicklable_exceptions_reach_the_caller(tmp_path, where, how, raises):

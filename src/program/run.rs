@@ -248,12 +248,12 @@ impl RunFailure {
         Self { exit, failure: error.into() }
     }
 
-    /// Prints the reason: as an event too, if events are printed; with `--quiet` then only as an event.
-    fn report(self, arguments: &Arguments) -> Exit {
+    /// Prints the reason: as an event too, if events are printed; with `--quiet` then only as an event. `invalid` if the scenario is.
+    fn report(self, arguments: &Arguments, invalid: bool) -> Exit {
         let Self { exit, failure } = self;
         let error = |(text, code): &(String, &str)| serde_json::json!({ "text": text, "code": code });
         let errors: Vec<_> = failure.0.iter().map(error).collect();
-        let fields = serde_json::json!({ "errors": errors, "exit": exit.code() });
+        let fields = serde_json::json!({ "errors": errors, "invalid": invalid, "exit": exit.code() });
         match arguments.events.then(|| event("error", fields)) {
             Some(Ok(())) if arguments.quiet => exit,
             _ => fail(exit, failure),
@@ -285,6 +285,7 @@ pub fn run(arguments: &Arguments) -> Exit {
     if let Err(exit) = write_verdict(Err("the run did not finish")) {
         return exit;
     }
+    let invalid = loaded.is_err();
     let result = loaded.and_then(|scenario| attempt(arguments, &scenario));
     let summary = result.as_ref().map(|(summary, _)| summary);
     let reason = result.as_ref().err().map(|failed| failed.failure.to_string()).unwrap_or_default();
@@ -294,7 +295,7 @@ pub fn run(arguments: &Arguments) -> Exit {
             let verdict = Verdict::new(&summary);
             verdict.print(arguments).map_or_else(|error| fail(Exit::Failure, error), |()| verdict.exit)
         }
-        Err(failed) => failed.report(arguments),
+        Err(failed) => failed.report(arguments, invalid),
     };
     match (written, exit) {
         (Err(failure), Exit::Ok) => failure,

@@ -73,7 +73,7 @@ class Program:
             reader.join()
             process.stdout.close()
         if errors is not None:
-            raise error_of(errors["errors"], errors["exit"] == 2)
+            raise error_of(errors["errors"], errors["invalid"])
         if directory is None:
             raise _ended(self.path, process.returncode)
         return (Path(directory) / "summary.json").read_text(encoding="utf-8"), directory
