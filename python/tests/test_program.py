@@ -202,3 +202,50 @@ def test_a_layout_comes_from_the_program():
     assert writes[0][2].names == ("current_a",)
     with pytest.raises(ValueError, match=re.escape("unknown-scenario")):
         seat.layout("motor-pear", "controller", program=PROGRAM)
+
+
+def test_a_seat_is_served_by_the_run_s_own_program(tmp_path):
+    """The frames of `serve-seat`, from a program in Python that ends as it is told."""
+    import sys
+    server = tmp_path / "server.py"
+    server.write_text('''
+import socket, struct, sys
+line = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=int(sys.argv[sys.argv.index("--fd") + 1]))
+assert sys.argv[1] == "serve-seat" and sys.argv[3] == "controller", sys.argv
+line.send(struct.pack("=QQQ", 1, 1, 2)); line.send(struct.pack("=Q", 2) + b"{}")
+for tick, present in enumerate([3, 1, 3]):
+    line.send(struct.pack("=QQQ6d", 3, tick, present, *range(6)))
+    kind, answered, *rest = struct.unpack("=QQ", line.recv(1 << 17)[:16])
+    assert answered == tick, (answered, tick)
+    if kind == 2:
+        line.send(struct.pack("=Q", 4) + b"computed-role-failed\\nit raised")
+        sys.exit(1)
+line.send(struct.pack("=Q", 4))
+''')
+
+    def signal_of(body, name, *fields):
+        stamp = [{"name": name, "kind": "u64", "count": 1, "offset": 8 * index} for index, name in enumerate("tgos")]
+        fields = [{"name": field, "kind": "f64", "count": 1, "offset": 32 + 8 * index} for index, field in enumerate(fields)]
+        return {"service": f"corotate/x/{body}/{name}", "signal": name, "fields": stamp + fields}
+
+    seat = {"program": [sys.executable, str(server)], "period_ns": 1_000_000, "writes": [signal_of("follower", "command", "current_a")],
+            "reads": [signal_of("leader", "estimate", "a", "b", "c"), signal_of("follower", "measurement", "d", "e")]}
+    from corotate import seat as module
+    samples = module.Samples(seat)
+    process = module.SeatProcess(seat, str(tmp_path), "controller", samples)
+    asked, answer = [], None
+    while (tick := process.next(answer)) is not None:
+        asked.append(tick)
+        answer = [np.float64(1.0).tobytes()]
+    assert [number for number, _, _ in asked] == [0, 1, 2] and asked[1][1][1] is None
+    assert samples.inputs(asked[0][1]).measurement.e == 4.0 and process._process.returncode == 0
+    process = module.SeatProcess(seat, str(tmp_path), "controller", samples)
+    process.next(None)
+    process.fail("Traceback: it raised")
+    process.close()
+    assert process._process.returncode == 1
+    process = module.SeatProcess(seat, str(tmp_path), "controller", samples)
+    process.next(None)
+    process._process.kill()
+    with pytest.raises(corotate.CorotateError):
+        process.next([b""])

@@ -290,3 +290,91 @@ fn toml_value(text: &str) -> Result<toml::Value, Failure> {
         Failure::new("no-value", format!("{text} is not a value; give a number, a list of numbers, or true or false"))
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::SHIPPED;
+
+    fn session() -> StepSession<'static> {
+        StepSession::new(|text, kind, set| {
+            assert_eq!(kind, ScenarioKind::Text);
+            Scenario::parse(text, "test", set)
+        })
+    }
+
+    fn begin(session: &mut StepSession<'_>, set: &[&str]) -> Vec<u8> {
+        let begin = json!({
+            "scenario": SHIPPED[0].1, "kind": "text", "set": set, "keep": false, "out": null, "overwrite": false,
+        });
+        session.answer(&[b"b", begin.to_string().as_bytes()].concat())
+    }
+
+    fn code(answer: &[u8]) -> (bool, String) {
+        assert_eq!(answer[0], 1, "an error");
+        let error: Value = serde_json::from_slice(&answer[1..]).unwrap();
+        (error["invalid"] == true, error["errors"][0]["code"].as_str().unwrap().to_owned())
+    }
+
+    #[test]
+    fn a_wrong_request_is_an_error_with_its_code_and_the_run_goes_on() {
+        let mut session = session();
+        for request in [&b""[..], b"o", b"a", b"f", b"x", b"b{}", b"\xff\xff"] {
+            let (invalid, code) = code(&session.answer(request));
+            assert!(!invalid && ["malformed", "run-over"].contains(&&*code), "{request:?}: {code}");
+        }
+        assert_eq!(code(&begin(&mut session, &["duration_s=-1"])), (true, "out-of-range".to_owned()));
+        assert_eq!(begin(&mut session, &["duration_s=1", "accept={}"])[0], 0);
+        assert_eq!(session.answer(b"o")[0], 0);
+        for (request, expected) in [
+            (&b"a1234567"[..], "malformed"),
+            (b"a12345678", "wrong-length"),
+            (b"r12345678", "wrong-length"),
+            (b"i[\"no.such\", \"1\"]", "not-tunable"),
+            (b"i[\"seed\", \"[\"]", "no-value"),
+            (b"x", "malformed"),
+        ] {
+            assert_eq!(code(&session.answer(request)), (false, expected.to_owned()), "{request:?}");
+        }
+        let done = session.answer(b"f");
+        let summary: Value = serde_json::from_slice(&done[1..]).unwrap();
+        assert!(summary["summary"]["books"]["balanced"] == true && summary["directory"].is_null());
+    }
+
+    /// Two loops of different pasts have the same samples and states from the tick on at which one takes the other's state.
+    #[test]
+    fn a_state_determines_the_next_ones_also_with_commands_in_flight() {
+        for delay in [1, 3] {
+            let command = |value: f64| {
+                let mut words = vec![0_u64; session_words()];
+                words[..3].fill(value.to_bits());
+                let bytes: Vec<u8> = words.iter().flat_map(|word| word.to_ne_bytes()).collect();
+                [b"a", &bytes[..]].concat()
+            };
+            let run = |factor: f64| {
+                let mut session = session();
+                let delay = format!("actuation_delay_ticks={delay}");
+                assert_eq!(begin(&mut session, &["duration_s=1", "accept={}", "limits={}", &delay])[0], 0);
+                assert_eq!(session.answer(b"o")[0], 0);
+                (0..20).for_each(|tick| assert_eq!(session.answer(&command(factor * f64::from(tick)))[0], 0));
+                session
+            };
+            let (mut one, mut two) = (run(0.1), run(-0.2));
+            let state = one.answer(b"s");
+            assert!(two.answer(b"s") != state && state.len() > 8 * 12);
+            assert_eq!(two.answer(&[b"r", &state[1..]].concat()), [0]);
+            assert_eq!(two.answer(b"s"), state);
+            for tick in 20..30 {
+                let step = command(f64::from(tick));
+                assert_eq!(one.answer(&step), two.answer(&step), "delay {delay}, tick {tick}");
+                assert_eq!(one.answer(b"s"), two.answer(b"s"), "delay {delay}, tick {tick}");
+            }
+        }
+    }
+
+    fn session_words() -> usize {
+        let scenario = Scenario::parse(SHIPPED[0].1, "test", &[]).unwrap();
+        let writes = ports(&scenario, RoleId::Controller).writes;
+        writes.iter().map(|port| port.size / size_of::<u64>() - STAMP).sum()
+    }
+}

@@ -260,6 +260,11 @@ class SeatProcess:
     def fail(self, text):
         """Ends the role, and with it the run, for a reason."""
         self._send(struct.pack("=QQ", FAILURE, self._tick) + text.encode()[-TEXT_BYTES:])
+        # Closed before it has read the reason, the process would report a lost program instead.
+        self._socket.settimeout(5)
+        with contextlib.suppress(OSError):
+            while self._socket.recv(FRAME_BYTES):
+                pass
 
     def _send(self, frame):
         try:

@@ -124,6 +124,10 @@ mod tests {
             };
             assert_eq!(line.due(tick), expected);
         }
+        // Ticks 16 and 17 are in flight after tick 18; that of tick 15 has been applied at it.
+        let mut moved = DelayLine::new(3, || 0_u64);
+        (0..18).for_each(|tick| *moved.put(tick) = 100 + tick);
+        assert_eq!(moved.in_flight_mut().map(|command| *command).collect::<Vec<_>>(), [116, 117]);
         assert_eq!(line.wanted_at(100), 97, "commands that can no longer be applied are not wanted");
         assert_eq!(line.due(100), Due::Missing);
     }
