@@ -4,7 +4,8 @@ use corotate::Program;
 use corotate::config::{ConfigError, RunId, SHIPPED};
 use corotate::late::{LateReport, LateTick};
 use corotate::launch::{
-    Launch, Outcome, Progress, ScenarioKind, Summary, claim, make_directory, make_latest, new_run, run as launch, write_run,
+    Launch, Outcome, Progress, ScenarioKind, Summary, claim, make_directory, make_latest, new_run, run as launch,
+    write_run,
 };
 use corotate::scenario::Scenario;
 use corotate::scenario::shipped as rigs;

@@ -86,14 +86,16 @@ struct TruthReader {
 }
 
 impl TruthReader {
-    fn new(port: &Port, bus: &MemoryBus) -> Result<Self, BusError> {
+    /// Reads `port`. The applied command is in the field `applied_…`, or else in that of the first field's name of `command`.
+    fn new(port: &Port, command: Option<&Port>, bus: &MemoryBus) -> Result<Self, BusError> {
         let word = |field: &Field| field.offset / size_of::<u64>();
-        let named = |matches: fn(&str) -> bool| port.fields.iter().find(|field| matches(field.name));
-        let applied = named(|name| name.starts_with("applied_"));
+        let named = |matches: &dyn Fn(&str) -> bool| port.fields.iter().find(|field| matches(field.name));
+        let first = command.and_then(|command| command.fields.first()).map(|field| field.name);
+        let applied = named(&|name| name.starts_with("applied_")).or_else(|| named(&|name| first == Some(name)));
         Ok(Self {
             reader: port.reader(bus, Reader::Scorer)?,
             applied: applied.map_or((0, 0), |field| (word(field), field.count)),
-            status: named(|name| name == "status").map(word),
+            status: named(&|name| name == "status").map(word),
             state: BodyState { body: port.topic.body.clone(), ..BodyState::default() },
         })
     }
@@ -162,7 +164,11 @@ impl Steps {
         let (inputs, outputs) = (vec![None; readers.len()], controller_ports.writes);
         let written = seats.iter().flat_map(|(role, _)| ports(&scenario, *role).writes);
         let truths = written.filter(|port| port.topic.signal == Signal::Truth);
-        let truths = truths.map(|port| TruthReader::new(&port, &bus)).collect::<Result<_, _>>()?;
+        let truth = |port: Port| {
+            let command = outputs.iter().find(|command| command.topic.body == port.topic.body);
+            TruthReader::new(&port, command, &bus)
+        };
+        let truths = truths.map(truth).collect::<Result<_, _>>()?;
         Ok(Self {
             scenario,
             seats,

@@ -230,7 +230,10 @@ class SeatProcess:
         if outputs is not None:
             self._send(struct.pack("=QQ", OUTPUTS, self._tick) + b"".join(outputs))
         while True:
-            frame = self._socket.recv(FRAME_BYTES)
+            try:
+                frame = self._socket.recv(FRAME_BYTES)
+            except ConnectionError:
+                frame = b""
             kind = struct.unpack_from("=Q", frame)[0] if frame else None
             if kind == TICK:
                 return self._asked(frame)
