@@ -205,7 +205,7 @@ def test_a_layout_comes_from_the_program():
 
 
 def test_a_seat_is_served_by_the_run_s_own_program(tmp_path):
-    """The frames of `serve-seat`, from a program in Python that ends as it is told."""
+    """The frames of `serve-seat`, from a program in Python, which ends as it is asked to."""
     import sys
     server = tmp_path / "server.py"
     server.write_text('''

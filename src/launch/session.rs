@@ -359,15 +359,15 @@ mod tests {
                 (0..20).for_each(|tick| assert_eq!(session.answer(&command(factor * f64::from(tick)))[0], 0));
                 session
             };
-            let (mut one, mut two) = (run(0.1), run(-0.2));
-            let state = one.answer(b"s");
-            assert!(two.answer(b"s") != state && state.len() > 8 * 12);
-            assert_eq!(two.answer(&[b"r", &state[1..]].concat()), [0]);
-            assert_eq!(two.answer(b"s"), state);
+            let (mut first, mut second) = (run(0.1), run(-0.2));
+            let state = first.answer(b"s");
+            assert!(second.answer(b"s") != state && state.len() > 8 * 12);
+            assert_eq!(second.answer(&[b"r", &state[1..]].concat()), [0]);
+            assert_eq!(second.answer(b"s"), state);
             for tick in 20..30 {
                 let step = command(f64::from(tick));
-                assert_eq!(one.answer(&step), two.answer(&step), "delay {delay}, tick {tick}");
-                assert_eq!(one.answer(b"s"), two.answer(b"s"), "delay {delay}, tick {tick}");
+                assert_eq!(first.answer(&step), second.answer(&step), "delay {delay}, tick {tick}");
+                assert_eq!(first.answer(b"s"), second.answer(b"s"), "delay {delay}, tick {tick}");
             }
         }
     }
