@@ -356,9 +356,9 @@ fn a_foreign_role_sees_changes_of_inputs_as_a_signal() {
     let gain = "controller.gain_per_s";
     let expected = serde_json::json!([
         [0, 1000, "observer.decay_rate_per_s", [9.0]],
-        [1, 2000, "follower.0.disturbance_rad_s2", [0.0; 3]],
-        [2, ticks[0], gain, [6.0; 3]],
-        [3, ticks[1], gain, [3.0; 3]],
+        [1, 2000, "follower.0.disturbance_rad_s2", [0.0, 0.0, 0.0]],
+        [2, ticks[0], gain, [6.0, 6.0, 6.0]],
+        [3, ticks[1], gain, [3.0, 3.0, 3.0]],
     ]);
     assert_eq!(seen, expected);
     let bytes = std::fs::read(bench.path("out/run.mcap")).unwrap();
