@@ -76,7 +76,7 @@ struct Arguments {
 #[allow(clippy::large_enum_variant, reason = "parsed once, never moved on a path that counts")]
 enum Command {
     /// Run a scenario and print its verdict
-    Run(run::Arguments),
+    Run(Box<run::Arguments>),
     /// Run a campaign: many variants of one scenario, on all cores
     Sweep(sweep::Arguments),
     /// Validate scenarios and print the claims about their loops
