@@ -56,7 +56,8 @@ class Env(gymnasium.Env):
 
     def _begin(self, more):
         changes = {**self._changes, **more}
-        if self._session is None:
+        # The process of a program may have died.
+        if self._session is None or getattr(self._session, "closed", False):
             self._session = session(self._program)
         try:
             return Steps(self._session, *self._given, changes).observe()

@@ -141,7 +141,7 @@ class StepProcess:
     """A program that steps runs: each request has an answer."""
 
     def __init__(self, path):
-        self._path = path
+        self._path, self.closed = path, False
         self._socket, theirs = socket.socketpair()
         with theirs:
             # What a rig prints goes to the error output.
@@ -172,6 +172,7 @@ class StepProcess:
 
     def close(self):
         """Ends the process."""
+        self.closed = True
         self._answers.close()
         self._socket.close()
         try:
