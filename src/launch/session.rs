@@ -16,7 +16,7 @@
 //! An error is JSON: `invalid` if the scenario is, and `errors`, each a text and a code.
 
 use super::{Claim, Steps, Summary, claim, make_directory, make_latest, new_run, write_run};
-use crate::config::ConfigError;
+use crate::config::{ClockKind, ConfigError};
 use crate::failure::Failure;
 use crate::runtime::{RoleId, ports};
 use crate::sample::{Stamp, status};
@@ -154,6 +154,7 @@ impl<'a> StepSession<'a> {
         let load = || (self.load)(&begin.scenario, begin.kind, &begin.set).map_err(RequestError::invalid);
         let (mut steps, mut scenario) = (Steps::new(load()?)?, load()?);
         let id = new_run().map_err(|error| Failure::new("no-random-numbers", error))?;
+        scenario.clock = ClockKind::InProcess;
         scenario.inputs.receive_in(steps.received());
         scenario.run = Some(id);
         let started = SystemTime::now();
