@@ -5,8 +5,8 @@
 //!
 //! | operation | content | answer |
 //! |---|---|---|
-//! | `b` begin | JSON: [`Begin`] | JSON: the controller's seat, the limits of its samples, the numbers of the state of each role |
-//! | `o` observe | | [the samples](StepSession::observe) of the first tick |
+//! | `b` begin | JSON: `Begin` | JSON: the controller's seat, the limits of its samples, the numbers of the state of each role |
+//! | `o` observe | | the samples (`SteppedRun::observe`) of the first tick |
 //! | `a` act | the words of each command | the samples of the next tick |
 //! | `s` state | | numbers |
 //! | `r` replace the state | numbers | |
