@@ -73,7 +73,6 @@ struct Arguments {
 }
 
 #[derive(Subcommand)]
-#[allow(clippy::large_enum_variant, reason = "parsed once, never moved on a path that counts")]
 enum Command {
     /// Run a scenario and print its verdict
     Run(Box<run::Arguments>),

@@ -14,11 +14,19 @@ use crate::rig::Rig;
 const DISTURBANCE: f64 = 1e-5;
 
 impl<R: Rig> Analysis<'_, R> {
+    /// Returns the rate, or the reason why there is none, with the floors of the settled loop.
+    pub fn rate_by_running(&self) -> (Result<f64, String>, Vec<f64>) {
+        match self.settled_floors() {
+            Err(reason) => (Err(reason), Vec::new()),
+            Ok(floors) => (self.judge(&self.exponent_of_disturbance()), floors),
+        }
+    }
+
     /// Runs the loop as it is, from the scenario's start, and returns the largest value of every metric in the last quarter.
     ///
     /// # Errors
     /// The reason why the loop is not settled by then.
-    pub fn settled_floors(&self) -> Result<Vec<f64>, String> {
+    fn settled_floors(&self) -> Result<Vec<f64>, String> {
         let ticks = self.scenario.last_tick.clamp(1, SCENARIO_TICKS_MAX);
         let mut chain = Chain::examine(self.rig, self.index, self.scenario);
         let mut floors = vec![0.0_f64; self.rig.metrics().len()];
@@ -51,7 +59,7 @@ impl<R: Rig> Analysis<'_, R> {
     }
 
     /// Computes the largest exponent of the loop's error from how a disturbance of its sensors falls.
-    pub fn exponent_of_disturbance(&self) -> Exponent {
+    fn exponent_of_disturbance(&self) -> Exponent {
         let ideal = self.rig.ideal();
         let [mut calm, mut disturbed] = [(); 2].map(|()| Chain::examine(&ideal, self.index, self.scenario));
         let (mut here, mut measured) = (Vec::new(), Vec::new());

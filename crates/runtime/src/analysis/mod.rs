@@ -17,6 +17,7 @@ mod subject;
 pub use digits::{apart, digits, to_tolerance};
 
 use crate::config::Settings;
+use crate::panics;
 use crate::rig::{CertificateReport, ConditionReport, Figure, Rig, Start};
 use chain::{Chain, Guards};
 use fall::Fall;
@@ -95,10 +96,9 @@ pub(crate) fn of_rig<R: Rig>(rig: &R, scenario: &Settings) -> Vec<Claim> {
 impl<R: Rig> Analysis<'_, R> {
     fn claim(&self, body: &str, certificate: Option<&CertificateReport>) -> Claim {
         let (rate, floors) = match self.rig.isolated(self.index, Start::Settled, false) {
-            None => match self.settled_floors() {
-                Err(reason) => (Err(reason), Vec::new()),
-                Ok(floors) => (self.judge(&self.exponent_of_disturbance()), floors),
-            },
+            None => panics::catch_quietly(|| self.rate_by_running()).unwrap_or_else(|panic| {
+                (Err(format!("the analysis runs the rig's own code, and {panic}")), Vec::new())
+            }),
             Some(settled) => {
                 let exponent = self.exponent(&settled);
                 match self.judge(&exponent) {
