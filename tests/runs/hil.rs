@@ -8,7 +8,7 @@ use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Read, Reader, Signal, Write};
 use corotate::clock::monotonic_ns;
 use corotate::config::ClockKind;
-use corotate::inputs::{Answer, Request, WantedChange, request};
+use corotate::inputs::{Answer, InputError, Request, WantedChange, request};
 use corotate::runtime::{Input, Poll, RoleId, RunCondition, Seek, depths, drive_in_turn, private_ledger, topic};
 use corotate::sample::{
     FieldKind, Health, NO_SAMPLE, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, status,
@@ -347,7 +347,7 @@ fn a_foreign_role_sees_changes_of_inputs_as_a_signal() {
     // The follower's program does not take a change for itself.
     let own = WantedChange { key: "actuator.safe".to_owned(), value: true.into(), ramp_s: 0.0 };
     match request(&domain, &Request::Set { changes: vec![own], at_tick: None }) {
-        Ok(Answer::Refused { code, .. }) => assert_eq!(code, "external-role"),
+        Err(InputError::Refused { code, .. }) => assert_eq!(code, "external-role"),
         answer => panic!("{answer:?}"),
     }
     let (run, follower) = (run.wait(), follower.wait());

@@ -50,6 +50,13 @@ shape = "pulse"
 duration_s = 0.1
 
 [[input]]
+at_s = 2.35
+key = "actuator.disconnected"
+value = true
+shape = "pulse"
+duration_s = 0.05
+
+[[input]]
 at_s = 2.4
 key = "follower.0.offset_rad_s"
 value = [0.1, 0.0, 0.0]
@@ -82,7 +89,10 @@ fn scripted_changes_give_one_hash_in_every_clock_and_replay() {
     let bench = Bench::new();
     let file = scenario(&bench, CHANGES);
     let expected = run(&bench, &file, "in-process", &[]);
-    assert_eq!(expected["inputs"].as_array().unwrap().len(), 7);
+    assert_eq!(expected["inputs"].as_array().unwrap().len(), 8);
+    // The pulse of the safe command, and the 50 ticks without a controller, 19 of them held. No command was missing.
+    assert_eq!(expected["books"]["roles"]["follower"]["starved"], 0);
+    assert_eq!(expected["score"]["statuses"]["follower/truth"], json!({"holding": 19, "safe": 131}));
     let constant = bench.summary("rigid-pair", &["--clock", "in-process", "--duration", "3", "--set", "accept={}"]);
     assert_ne!(expected["state"]["hash"], constant["state"]["hash"]);
     assert_eq!(run(&bench, &file, "lockstep", &[])["state"]["hash"], expected["state"]["hash"]);
@@ -106,6 +116,8 @@ fn a_kill_in_the_tick_of_a_change_costs_no_bit() {
         ("controller", 1000),
         ("controller", 1201),
         ("controller", 1450),
+        ("follower", 2360),
+        ("follower", 2380),
         ("observer", 1200),
         ("observer", 1201),
         ("follower", 1500),

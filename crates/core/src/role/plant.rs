@@ -66,7 +66,7 @@ pub enum CommandEvent {
     NotDue,
     /// The command arrived in time and acts.
     Applied,
-    /// The command arrived in time, but the safe command is latched.
+    /// The command arrived in time, but the safe command is latched, or a switch has disconnected the body from its controller.
     Refused,
     /// The command was missing, late or unusable; the last input is held.
     Held,
@@ -93,6 +93,8 @@ pub struct Plant<B> {
     safe: bool,
     /// True while a switch demands the safe command.
     demanded_safe: bool,
+    /// True while a switch keeps commands from the body.
+    disconnected: bool,
     /// True if the command of this tick arrived and was not accepted.
     rejected: bool,
 }
@@ -100,7 +102,16 @@ pub struct Plant<B> {
 impl<B: Body> Plant<B> {
     /// Creates a plant at its initial state. `tick_s` is the period h in seconds.
     pub fn new(body: B, actuation: Actuation, tick_s: f64) -> Self {
-        Self { body, actuation, tick_s, missing_ticks: 0, safe: false, demanded_safe: false, rejected: false }
+        Self {
+            body,
+            actuation,
+            tick_s,
+            missing_ticks: 0,
+            safe: false,
+            demanded_safe: false,
+            disconnected: false,
+            rejected: false,
+        }
     }
 
     /// Returns true if the plant takes commands.
@@ -123,6 +134,10 @@ impl<B: Body> Plant<B> {
         let latched = self.safe && (self.actuation.rearm == Rearm::Manual || self.demanded_safe);
         match command.filter(|command| command.stamp().tick == tick - self.actuation.delay_ticks) {
             Some(_) if latched => CommandEvent::Refused,
+            Some(_) if self.disconnected => {
+                self.miss_command();
+                CommandEvent::Refused
+            }
             Some(command) if self.body.apply(command) => {
                 self.missing_ticks = 0;
                 self.safe = false;
@@ -158,6 +173,12 @@ impl<B: Body> Plant<B> {
         } else {
             (self.safe, self.missing_ticks) = (false, 0);
         }
+    }
+
+    /// Keeps commands from the body until this is called with `false`: it holds its input, then the safe command acts after the
+    /// timeout, as if the controller were off.
+    pub fn disconnect(&mut self, disconnected: bool) {
+        self.disconnected = disconnected;
     }
 
     /// Applies the safe command at once, as after the command timeout.
@@ -244,6 +265,7 @@ impl<B: Persist> Persist for Plant<B> {
         self.missing_ticks.persist(words);
         self.safe.persist(words);
         self.demanded_safe.persist(words);
+        self.disconnected.persist(words);
         self.rejected.persist(words);
     }
 }

@@ -69,6 +69,9 @@ pub struct InputUse {
     pub port: usize,
 }
 
+/// The port of the switch that keeps commands from a body; an actuator knows the one for the safe command as 0.
+pub(crate) const DISCONNECTED: usize = 1;
+
 /// A part of a loop that uses an input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InputUser {

@@ -26,6 +26,7 @@ pub use document::{Document, read_text};
 pub use error::{ConfigError, PathError, Place, Problem};
 pub use fault::ScriptedFault;
 pub use hosts::{ClockSource, Host, Hosts, LinkBudget, Network};
+pub(crate) use input::DISCONNECTED;
 pub use input::{ChangeLists, InputInfo, InputUse, InputUser, Inputs, ResponseField, Variability, set_point_of};
 pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Trace, Wake};
 pub(crate) use reader::keys_of;

@@ -89,6 +89,8 @@ pub(crate) struct Actuator {
     pub rearm: Rearm,
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub safe: bool,
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub disconnected: bool,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -100,7 +102,7 @@ enum RearmName {
 
 impl Default for Actuator {
     fn default() -> Self {
-        Self { command_timeout_ticks: 20, rearm: Rearm::Auto, safe: false }
+        Self { command_timeout_ticks: 20, rearm: Rearm::Auto, safe: false, disconnected: false }
     }
 }
 

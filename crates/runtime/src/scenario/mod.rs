@@ -23,8 +23,8 @@ use crate::config::accept::{self, Accept};
 use crate::config::hosts::{self, Hosts};
 use crate::config::raw::{Launch, Policy, Raw};
 use crate::config::{
-    BodyInfo, Checks, ClockKind, ConfigError, Cores, Document, InputInfo, InputUser, Inputs, NotExternal, Realtime,
-    Settings, Shape, Supervision, Variability, fault, input, nearest, reference, watchdog,
+    BodyInfo, Checks, ClockKind, ConfigError, Cores, DISCONNECTED, Document, InputInfo, InputUser, Inputs, NotExternal,
+    Realtime, Settings, Shape, Supervision, Variability, fault, input, nearest, reference, watchdog,
 };
 use crate::control::{ACTUATION_DELAY_MAX, WatchBounds};
 use crate::rig::Context;
@@ -169,7 +169,7 @@ impl Scenario {
             };
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
             inputs.infos = rig.inputs();
-            inputs.infos.extend(safe_switch(&raw, rig.bodies()));
+            inputs.infos.extend(actuator_switches(&raw, rig.bodies()));
             let fields = rig.reference();
             reference::read_files(&mut raw.reference, &fields, &mut checks);
             let referred = reference::inputs(&raw.reference, &fields, (rig.bodies(), &signals), &mut checks);
@@ -247,14 +247,20 @@ impl Scenario {
     }
 }
 
-/// Returns the switch that demands the safe command of every driven body; `None` if the scenario drives no body.
-fn safe_switch(raw: &Raw, bodies: &[BodyInfo]) -> Option<InputInfo> {
-    let driven = bodies.iter().enumerate().filter(|(_, body)| body.driven);
-    let description = "actuators apply the safe command; false re-arms them";
-    let initial = [f64::from(u8::from(raw.actuator.safe))];
-    let input = InputInfo::new("actuator.safe", Variability::Switch, description, &initial).within(0.0, 1.0);
-    let input = input.used_by(driven.map(|(index, _)| InputUser::Actuator(index)), 0);
-    (!input.uses.is_empty()).then_some(input)
+/// Returns the switches of the actuators of all driven bodies; none if the scenario drives no body.
+fn actuator_switches(raw: &Raw, bodies: &[BodyInfo]) -> Vec<InputInfo> {
+    let driven = || bodies.iter().enumerate().filter(|(_, body)| body.driven);
+    let switch = |(key, description, on, port): (&str, &'static str, bool, usize)| {
+        let input = InputInfo::new(key, Variability::Switch, description, &[f64::from(u8::from(on))]).within(0.0, 1.0);
+        input.used_by(driven().map(|(index, _)| InputUser::Actuator(index)), port)
+    };
+    let safe = "actuators apply the safe command; false re-arms them";
+    let disconnected = "actuators ignore the controller: they hold, then apply the safe command";
+    let switches = [
+        ("actuator.safe", safe, raw.actuator.safe, 0),
+        ("actuator.disconnected", disconnected, raw.actuator.disconnected, DISCONNECTED),
+    ];
+    switches.map(switch).into_iter().filter(|input| !input.uses.is_empty()).collect()
 }
 
 /// Returns the mistakes of a scenario in which a key has another value: reason and code of each.

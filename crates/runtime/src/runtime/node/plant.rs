@@ -6,7 +6,7 @@ use super::missed::MissedTicks;
 use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Carried, Reader, Signal};
 use crate::clock::{Clock, Grid};
-use crate::config::InputUser;
+use crate::config::{DISCONNECTED, InputUser};
 use crate::rig::{BodyInfo, DelayLine, Due};
 use crate::role::{Body, CommandEvent, Guard, Plant};
 use crate::runtime::disturb::Interruptions;
@@ -279,6 +279,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
 
 fn set_input<P: LinkedBody>(plant: &mut Plant<P>, new: NewValue<'_>) {
     match new.by.user {
+        InputUser::Actuator(_) if new.by.port == DISCONNECTED => plant.disconnect(new.values[0] != 0.0),
         InputUser::Actuator(_) => plant.demand_safe(new.values[0] != 0.0),
         _ => plant.set_input(new.by.port, new.values),
     }
