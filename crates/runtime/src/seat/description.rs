@@ -120,7 +120,7 @@ struct InputDescription {
     components: usize,
     /// The values until the first change.
     initial: Vec<f64>,
-    /// The least and the largest value of a component; null where there is none.
+    /// The least and the largest value of a component; null where it is unbounded.
     range: [Option<f64>; 2],
     /// The names of the roles that use it.
     users: Vec<String>,
