@@ -82,6 +82,6 @@ fn the_claimed_rate_is_that_of_the_linearised_loop() {
     assert!((rate_per_s / RATE_PER_S - 1.0).abs() < 0.01, "{rate_per_s}");
     let unstable = bench.run(&["check", "cart-pole", "--json", "--set", "cart.gain=[0,0,0,0]", "--set", "accept={}"]);
     assert_eq!(unstable.json()["followers"][0]["loop_rate_per_s"], Value::Null, "{unstable:?}");
-    let tunable = bench.run(&["check", "cart-pole", "--tunable", "--json"]).succeeded().stdout;
+    let tunable = bench.run(&["check", "cart-pole", "--tunable"]).succeeded().stdout;
     assert!(tunable.contains("reference.position_m") && tunable.contains("cart.push_n"), "{tunable}");
 }

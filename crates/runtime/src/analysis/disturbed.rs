@@ -14,7 +14,7 @@ use crate::rig::Rig;
 const DISTURBANCE: f64 = 1e-5;
 
 impl<R: Rig> Analysis<'_, R> {
-    /// Returns the rate, or the reason why there is none, with the floors of the settled loop.
+    /// Returns the rate, or the reason why it is unknown, with the floors of the settled loop.
     pub fn rate_by_running(&self) -> (Result<f64, String>, Vec<f64>) {
         match self.settled_floors() {
             Err(reason) => (Err(reason), Vec::new()),
