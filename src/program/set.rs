@@ -216,7 +216,7 @@ pub fn tunable(scenario: &Scenario) -> String {
             Variability::Switch => "switch",
         };
         let range = match (info.variability, info.range) {
-            (Variability::Switch, _) => String::new(),
+            (Variability::Switch, _) | (_, (f64::NEG_INFINITY, f64::INFINITY)) => String::new(),
             (_, (least, f64::INFINITY)) => format!(", above {least}"),
             (_, (least, largest)) => {
                 format!(", {} to {}", crate::analysis::digits(least), crate::analysis::digits(largest))

@@ -251,7 +251,7 @@ fn at_a_file_size_limit_the_recording_stays_readable_and_the_loop_continues() {
     for clock in ["in-process", "lockstep"] {
         let program = bench.command().get_program().to_owned();
         let script = format!(
-            "ulimit -f 600; exec {} run {} --record --out {clock} --clock {clock} --duration 6 --set 'accept={{}}'",
+            "ulimit -f 4000; exec {} run {} --record --out {clock} --clock {clock} --duration 20 --set 'accept={{}}'",
             program.to_str().unwrap(),
             shipped("rigid-pair").display()
         );
@@ -259,11 +259,11 @@ fn at_a_file_size_limit_the_recording_stays_readable_and_the_loop_continues() {
         assert_eq!(done.code, Some(1), "{done:?}");
         assert!(done.says("incomplete-recording") && done.stderr.contains("run.mcap"), "{done:?}");
         let summary = bench.summary_in(clock);
-        assert_eq!(summary["score"]["scored_ticks"], 6001);
+        assert_eq!(summary["score"]["scored_ticks"], 20_001);
         assert_eq!(summary["recording"]["complete"], false);
         let signal = &summary["recording"]["signals"][0];
-        assert_eq!(signal["published"], 6001);
-        assert_eq!(signal["gaps"][0][1], 6000, "{signal}");
+        assert_eq!(signal["published"], 20_001);
+        assert_eq!(signal["gaps"][0][1], 20_000, "{signal}");
         let file = bench.path(clock).join("run.mcap");
         assert!(Recording::open(&file).unwrap().signals()[0].samples > 1000);
         assert_eq!(replay(&bench, &file, &[]).code, Some(1));

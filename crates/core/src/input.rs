@@ -297,12 +297,13 @@ mod tests {
             Shape::Sine { ticks: 9, frequency: 0.1 },
             Shape::Chirp { ticks: 9, frequency: 0.1, end_frequency: 0.2 },
             Shape::Prbs { ticks: 9, hold_ticks: 2, seed: 3 },
+            Shape::Row { ticks: u64::MAX },
         ];
         for shape in shapes {
             let written = change(u64::MAX, shape, -0.0);
             assert_eq!(Change::from_words(&written.words()), Some(written));
         }
-        assert_eq!(Change::from_words(&[6; CHANGE_WORDS]), None);
+        assert_eq!(Change::from_words(&[7; CHANGE_WORDS]), None);
     }
 
     proptest! {

@@ -112,7 +112,8 @@ mod tests {
     fn the_counters_grow_with_page_faults() {
         let usage = ThreadUsage::open();
         let before = usage.read();
-        let mut pages = vec![0_u8; 4 << 20];
+        // Too large for the allocator to serve from memory that other tests have touched.
+        let mut pages = vec![0_u8; 64 << 20];
         pages.iter_mut().step_by(4096).for_each(|byte| *byte = 1);
         std::hint::black_box(&mut pages);
         let grown = usage.read().since(&before);

@@ -310,12 +310,13 @@ mod tests {
         assert_eq!(seat["writes"][0]["qos"]["subscriber_max_buffer_size"], 128);
         assert_eq!(seat["schedule"]["buffer_size"], 1);
         assert_eq!(seat["transport"]["prefix"], domain.domain().prefix());
-        let place =
-            seat["inputs"].as_array().unwrap().iter().position(|input| input["key"] == "follower.0.disturbance_rad_s2");
-        let disturbance = &seat["inputs"][place.unwrap()];
-        assert_eq!((&disturbance["number"], &disturbance["components"]), (&place.into(), &3.into()));
+        let place = |key| seat["inputs"].as_array().unwrap().iter().position(|input| input["key"] == key).unwrap();
+        let number = place("follower.0.disturbance_rad_s2");
+        let disturbance = &seat["inputs"][number];
+        assert_eq!((&disturbance["number"], &disturbance["components"]), (&number.into(), &3.into()));
         assert_eq!(disturbance["users"], serde_json::json!(["follower"]));
-        assert_eq!(disturbance["range"][0], Value::Null);
+        assert_eq!(disturbance["range"][0].as_f64().unwrap(), -disturbance["range"][1].as_f64().unwrap());
+        assert_eq!(seat["inputs"][place("observer.decay_rate_per_s")]["range"], serde_json::json!([0.0, null]));
         assert_eq!(
             (&seat["input"]["service"], &seat["shapes"]["ramp"]),
             (&"corotate/rigid-pair/run/input".into(), &1.into())
