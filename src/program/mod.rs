@@ -33,6 +33,8 @@ mod runs;
 mod scenario;
 mod schema;
 mod seat;
+mod seat_header;
+mod serve_seat;
 mod set;
 mod shipped;
 mod signals;
@@ -136,6 +138,9 @@ enum Command {
     /// Step runs for the parent process
     #[command(hide = true)]
     Step,
+    /// Serve a seat to the program that started this one
+    #[command(hide = true)]
+    ServeSeat(serve_seat::Arguments),
     /// Be the other end of a measured hop
     #[command(hide = true)]
     BenchPeer(bench::PeerArguments),
@@ -299,6 +304,7 @@ fn execute(command: Option<Command>) -> Exit {
         Some(Command::Completions(arguments)) => help::completions(&arguments, Arguments::command()),
         Some(Command::Man(arguments)) => help::man(&arguments, Arguments::command()),
         Some(Command::Step) => step::step(),
+        Some(Command::ServeSeat(arguments)) => serve_seat::serve(&arguments),
         Some(Command::BenchPeer(arguments)) => Ok(bench::peer(&arguments)),
         Some(Command::Tracer(arguments)) => tracer::tracer(&arguments),
         Some(Command::Janitor(arguments)) => Ok(janitor(&arguments)),

@@ -3,6 +3,7 @@
 use super::output::{CommandResult, Exit, fail, say};
 use super::runs;
 use super::scenario::{Change, load};
+use super::seat_header::header;
 use crate::config::{ClockKind, NotExternal};
 use crate::runtime::RoleId;
 use crate::seat::{RoleError, describe_seat, join_run};
@@ -27,12 +28,17 @@ pub struct Arguments {
     /// The waiting run's domain or results directory, or latest; SCENARIO must be the domain's scenario.toml
     #[arg(long, value_name = "DIR")]
     domain: Option<PathBuf>,
+    /// Print the samples as a C header for libcorotate instead
+    #[arg(long, conflicts_with = "domain")]
+    header: bool,
 }
 
 const EXAMPLES: &str = "\
 Example:
   corotate seat pair.toml follower
-                                   services, samples and fields of the role";
+                                   services, samples and fields of the role
+  corotate seat pair.toml controller --header > controller.h
+                                   the structs for a program in C or C++";
 
 /// Prints the seat as JSON.
 pub fn seat(arguments: &Arguments) -> CommandResult {
@@ -47,6 +53,9 @@ pub fn seat(arguments: &Arguments) -> CommandResult {
         fail(Exit::Usage, RoleError::NoSuchRole { role, known })
     })?;
     scenario.check_external(&arguments.role).map_err(|error| fail(Exit::Usage, error))?;
+    if arguments.header {
+        return say(&header(&scenario, role));
+    }
     let root = arguments.domain.as_deref().map(|given| runs::domain(Some(given))).transpose()?;
     let domain = root.map(|root| join_run(&scenario, &root)).transpose();
     let domain = domain.map_err(|error| fail(Exit::Usage, error))?;

@@ -2,6 +2,7 @@
 
 mod actuation_delay;
 mod allocations;
+mod c_programs;
 mod claims;
 mod computed;
 mod conformance;
@@ -17,5 +18,6 @@ mod one_process;
 mod own_rig;
 mod processes;
 mod serial;
+mod served;
 mod timing;
 mod verdicts;

@@ -9,7 +9,7 @@ use std::sync::OnceLock;
 
 const TICKS: u64 = 10_001;
 
-fn program() -> &'static Path {
+pub(super) fn program() -> &'static Path {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
     PROGRAM.get_or_init(|| example("motor-pair"))
 }

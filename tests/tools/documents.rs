@@ -235,6 +235,7 @@ macro_rules! pages {
 pages! {
     readme: "README.md",
     quickstart: "docs/quickstart.md",
+    c_and_cpp: "docs/c-and-cpp.md",
     claims: "docs/claims.md",
     concepts: "docs/concepts.md",
     campaigns: "docs/campaigns.md",

@@ -122,6 +122,11 @@ impl InputInfo {
         Self { response, ..self }
     }
 
+    /// Returns the first use by a user for which `is_user` returns true.
+    pub fn use_by(&self, is_user: impl Fn(InputUser) -> bool) -> Option<InputUse> {
+        self.uses.iter().find(|by| is_user(by.user)).copied()
+    }
+
     /// Returns values as those of an input; missing components are zero.
     pub fn values(components: &[f64]) -> Values {
         let mut values = [0.0; COMPONENTS_MAX];

@@ -20,6 +20,7 @@ mod role_function;
 mod role_id;
 mod role_impl;
 mod role_inputs;
+mod role_values;
 mod sample_source;
 mod usage;
 
@@ -51,6 +52,7 @@ pub use role_function::{RoleFunction, TickSamples};
 pub use role_id::RoleId;
 pub use role_impl::RoleImpl;
 pub use role_inputs::{NewValue, RoleInputs};
+pub use role_values::{RoleValue, role_values};
 pub use usage::{ThreadUsage, watch_continued};
 
 use crate::bus::Depths;

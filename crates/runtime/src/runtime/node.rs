@@ -171,7 +171,7 @@ pub fn build_rig<R: Rig, B: Bus + 'static>(
             return Ok(Box::new(group::GroupNode::new(nodes, clock == Clock::Monotonic, scenario.last_tick)));
         }
         RoleImpl::Function(role, compute) => {
-            let function = FunctionRole::new(compute, &ports(scenario, role), (1 << R::AXES) - 1);
+            let function = Box::new(FunctionRole::new(compute, scenario, role, (1 << R::AXES) - 1));
             return role_node(rig, &context(&(role, ledger.reopened())), Some(SampleSource::Function(function)));
         }
         RoleImpl::Role(..) => {}

@@ -4,7 +4,10 @@
 //! Must not keep state between ticks: the function owns its state, which ends with its process.
 
 use super::error::NodeError;
-use super::node::ports::Ports;
+use super::node::ports::ports;
+use super::role_id::RoleId;
+use super::role_values::CurrentValues;
+use crate::config::Settings;
 use crate::sample::{Field, Stamp};
 
 /// Length of a stamp, words.
@@ -18,6 +21,9 @@ pub struct TickSamples<'a> {
     /// Input samples as words with stamps, in the order of the seat description; `None` where a sample is missing or
     /// rejected by its guard.
     pub inputs: &'a [Option<&'a [u64]>],
+    /// Values, at this tick, of the scenario's inputs that the role uses, in the order of
+    /// [`role_values`](super::role_values): gains, set points, disturbances.
+    pub values: &'a [f64],
     /// Output samples as words without stamps, in the order of the seat description. Initially zero, except `valid`,
     /// whose bits are all set. A truth that stays unchanged takes the measurement's values.
     pub outputs: &'a mut [Vec<u64>],
@@ -35,6 +41,7 @@ pub trait RoleFunction {
 /// A role function with its sample buffers.
 pub(crate) struct FunctionRole {
     compute: Box<dyn RoleFunction>,
+    values: CurrentValues,
     blank: Vec<Vec<u64>>,
     outputs: Vec<Vec<u64>>,
     /// Fields common to a plant's measurement and truth: first word in each, and number of words.
@@ -42,7 +49,8 @@ pub(crate) struct FunctionRole {
 }
 
 impl FunctionRole {
-    pub fn new(compute: Box<dyn RoleFunction>, ports: &Ports, valid: u64) -> Self {
+    pub fn new(compute: Box<dyn RoleFunction>, scenario: &Settings, role: RoleId, valid: u64) -> Self {
+        let (ports, values) = (ports(scenario, role), CurrentValues::new(&scenario.inputs, role));
         let blank: Vec<Vec<u64>> = ports
             .writes
             .iter()
@@ -58,14 +66,16 @@ impl FunctionRole {
             [measurement, truth] if ports.reads.len() <= 1 => common(&measurement.fields, &truth.fields),
             _ => Vec::new(),
         };
-        Self { compute, outputs: blank.clone(), blank, common }
+        Self { compute, values, outputs: blank.clone(), blank, common }
     }
 
     /// Calls the function for one tick.
     pub fn tick(&mut self, tick: u64, inputs: &[Option<&[u64]>]) -> Result<(), NodeError> {
         self.outputs.iter_mut().zip(&self.blank).for_each(|(output, blank)| output.copy_from_slice(blank));
-        let outputs = &mut self.outputs[..];
-        self.compute.compute(TickSamples { tick, inputs, outputs }).map_err(|reason| NodeError::Computed { reason })
+        let (values, outputs) = (self.values.at(tick), &mut self.outputs[..]);
+        self.compute
+            .compute(TickSamples { tick, inputs, values, outputs })
+            .map_err(|reason| NodeError::Computed { reason })
     }
 
     /// Copies output `index` into a sample, after the stamp.

@@ -64,6 +64,11 @@ impl RoleId {
         hosted
     }
 
+    /// Returns true if a user of inputs is a part of this role.
+    pub fn takes(self, user: InputUser) -> bool {
+        Self::using(user) == Some(self)
+    }
+
     /// Returns a number for records of fixed size: 1 for the observer, 2 for the controller, then the plants. 0 is no role.
     pub fn number(self) -> u64 {
         match self {

@@ -31,7 +31,7 @@ pub(crate) enum Progress {
 /// A source of a role's samples in place of the built-in role.
 pub(crate) enum SampleSource {
     /// A function; the role waits for its return.
-    Function(FunctionRole),
+    Function(Box<FunctionRole>),
     /// A device; the role polls until it answers.
     Device(DeviceHandle),
 }

@@ -9,9 +9,10 @@ use crate::bus::{Depths, Port, Reader, Signal};
 use crate::config::{InputInfo, Variability};
 use crate::input::Shape;
 use crate::role::Rearm;
-use crate::runtime::{RoleId, depths, ports, window_ticks};
+use crate::runtime::{RoleId, RoleValue, depths, ports, role_values, window_ticks};
 use crate::sample::{Field, FieldKind, NO_SAMPLE, Phase, RoleState, Stamp, status};
 use crate::scenario::Scenario;
+use crate::system::this_program;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -41,6 +42,8 @@ pub struct SeatDescription {
     actuation_delay_ticks: u64,
     command_timeout_ticks: u64,
     rearm: &'static str,
+    /// The command that starts the program of this description, as its file and first arguments; null if it is not text.
+    program: Option<Vec<String>>,
     transport: Transport,
     /// The loop's signals, in the order in which the built-in role opens them.
     writes: Vec<SignalDescription>,
@@ -53,6 +56,12 @@ pub struct SeatDescription {
     inputs: Vec<InputDescription>,
     /// The numbers of the shapes of a change.
     shapes: BTreeMap<&'static str, usize>,
+    /// Length of the stamp at the start of every sample, bytes.
+    stamp_size: usize,
+    /// The bits of a field `valid` in outputs that are left blank.
+    valid: u64,
+    /// The inputs of the scenario that the role uses.
+    values: Vec<ValueDescription>,
     /// The values of the schedule's `phase` and of health's `state`.
     phases: BTreeMap<&'static str, u64>,
     states: BTreeMap<&'static str, u64>,
@@ -126,6 +135,19 @@ struct InputDescription {
     users: Vec<String>,
 }
 
+/// An input of the scenario: its place among the numbers that a served seat receives with each tick.
+#[derive(Debug, Serialize)]
+struct ValueDescription {
+    key: String,
+    /// The index of its first number, and how many it has.
+    index: usize,
+    count: usize,
+    /// The meaning, with the unit.
+    description: String,
+    /// The numbers at tick 0, if the scenario does not change them there.
+    initial: Vec<f64>,
+}
+
 /// Exercise of the links before the first tick: number of samples of generation 0, and their interval.
 #[derive(Debug, Serialize)]
 struct WarmUp {
@@ -160,6 +182,7 @@ pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>)
             Rearm::Auto => "auto",
             Rearm::Manual => "manual",
         },
+        program: program_words(),
         transport: Transport::new(domain),
         writes: ports.writes.iter().map(written).collect(),
         reads: ports.reads.iter().map(read).collect(),
@@ -168,6 +191,9 @@ pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>)
         input: read(&ports.input),
         inputs: inputs(scenario),
         shapes: Shape::NAMES.into_iter().zip(0..).collect(),
+        stamp_size: size_of::<Stamp>(),
+        valid: (1 << scenario.rig.axes()) - 1,
+        values: role_values(&scenario.inputs, role).iter().map(ValueDescription::new).collect(),
         phases: Phase::NAMES.into_iter().map(|(name, phase)| (name, phase as u64)).collect(),
         states: RoleState::NAMES.into_iter().map(|(name, state)| (name, state as u64)).collect(),
         status: status::NAMES.into_iter().collect(),
@@ -252,6 +278,21 @@ impl SignalDescription {
             buffer_size: reader.map(|reader| iox::buffer_size(signal, reader, depths)),
         }
     }
+}
+
+impl ValueDescription {
+    fn new(value: &RoleValue<'_>) -> Self {
+        let (info, index) = (value.info, value.index);
+        let (count, initial) = (info.initial.len(), info.initial.clone());
+        Self { key: info.key.clone(), index, count, description: info.description.clone().into_owned(), initial }
+    }
+}
+
+/// Returns the command that starts this program; `None` if a word of it is not UTF-8.
+fn program_words() -> Option<Vec<String>> {
+    let command = this_program().ok()?;
+    let words = std::iter::once(command.get_program()).chain(command.get_args());
+    words.map(|word| word.to_str().map(str::to_owned)).collect()
 }
 
 impl FieldDescription {

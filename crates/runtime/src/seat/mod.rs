@@ -4,11 +4,13 @@
 //! |---|---|
 //! | `process` | a role of this program, or of a function, from its start to its report; the files of a domain |
 //! | `bridge` | a device in the place of a role |
+//! | `server` | a role whose samples another program computes, over a socket |
 //! | `description` | the seat description for foreign programs |
 
 mod bridge;
 mod description;
 mod process;
+mod server;
 
 pub use bridge::{BridgeResult, run_bridge};
 pub use description::{SeatDescription, describe_seat, join_run, seat_path};
@@ -20,3 +22,4 @@ pub use process::{
 };
 #[cfg(feature = "hosts")]
 pub use process::{clock_path, join};
+pub use server::{SEAT_PROTOCOL, serve_seat};

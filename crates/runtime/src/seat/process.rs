@@ -125,6 +125,24 @@ pub enum RoleError {
         /// Waiting time, s.
         waited_s: f64,
     },
+    /// The program that computes the role's samples is gone before the ticks.
+    #[error("no program computes this role: {reason}; start it again")]
+    #[strum(serialize = "no-seat-program")]
+    SeatProgram {
+        /// The reason.
+        reason: String,
+    },
+    /// The samples of the role do not fit into a frame.
+    #[error("the samples of {role} take {bytes} bytes per tick, and a frame holds {limit}; drive fewer bodies")]
+    #[strum(serialize = "frame-too-long")]
+    FrameTooLong {
+        /// The role.
+        role: String,
+        /// Length of a frame of the role, bytes.
+        bytes: usize,
+        /// Longest frame, bytes.
+        limit: usize,
+    },
     /// The role serves a fleet.
     #[error("a function cannot compute {role}, which serves a fleet; give its bodies roles of their own")]
     #[strum(serialize = "fleet-role")]
@@ -272,6 +290,15 @@ pub fn run_function(
     compute: Box<dyn RoleFunction>,
     terminated: &AtomicBool,
 ) -> Result<(), RoleError> {
+    run_function_with(address, terminated, |_, _, _| Ok(compute))
+}
+
+/// Runs a role whose samples a function computes, which `function` creates in the joined run.
+pub(super) fn run_function_with(
+    address: &RoleAddress,
+    terminated: &AtomicBool,
+    function: impl FnOnce(&Domain, &Scenario, RoleId) -> Result<Box<dyn RoleFunction>, RoleError>,
+) -> Result<(), RoleError> {
     let (domain, scenario) = join(&address.domain)?;
     let role = find_role(&scenario, &address.role)?;
     require_process(&scenario, role)?;
@@ -279,6 +306,7 @@ pub fn run_function(
     if ports.reads.iter().chain(&ports.writes).any(|port| port.fleet) {
         return Err(RoleError::Fleet { role: address.role.clone() });
     }
+    let compute = function(&domain, &scenario, role)?;
     let served = in_domain(&domain, &scenario, RoleImpl::Function(role, compute), terminated, |_| {});
     if let Err(RoleError::Node(NodeError::Computed { reason })) = &served {
         // For the launcher, which has no other connection to this process. The caller gets the error in any case.

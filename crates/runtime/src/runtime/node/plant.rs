@@ -42,7 +42,7 @@ pub struct PlantNode<P: LinkedBody, G, B: Bus> {
     inputs: RoleInputs,
     ledger: Ledger,
     /// The function that computes the samples, if not the body.
-    function: Option<FunctionRole>,
+    function: Option<Box<FunctionRole>>,
     inherited: Inherited,
     /// The executed tick whose truth is not sent and whose integration step is missing.
     unfinished: Option<u64>,
@@ -63,7 +63,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         guard: G,
         info: &BodyInfo,
         context: &NodeContext<'_, B>,
-        function: Option<FunctionRole>,
+        function: Option<Box<FunctionRole>>,
     ) -> Result<Self, BusError> {
         let scenario = context.scenario;
         let measurement = context.output(info, Signal::Measurement)?;
