@@ -152,13 +152,14 @@ pub fn new_domain(scenario: &Scenario) -> Result<OwnedDomain, LaunchError> {
 
 /// Writes the files into a domain that a process needs to join the run.
 pub(super) fn prepare(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain) -> Result<(), LaunchError> {
-    let path = scenario_path(domain);
-    write_whole(&path, scenario.to_file().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
     if let Some(results) = &launch.results {
         let path = results_path(domain.root());
         write_whole(&path, results.as_os_str().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
     }
     share_changes(scenario, domain)?;
+    // After the files that a process looks for once it has the scenario.
+    let path = scenario_path(domain);
+    write_whole(&path, scenario.to_file().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
     describe_seats(scenario, launch, domain)
 }
 

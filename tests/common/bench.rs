@@ -109,6 +109,11 @@ impl Bench {
         await_some(|| self.domains().iter().map(|domain| seat_path(domain, role)).find(|seat| seat.is_file()))
     }
 
+    /// Waits for a domain that other processes can join.
+    pub fn await_domain(&self) -> PathBuf {
+        await_some(|| self.domains().into_iter().find(|domain| domain.join("scenario.toml").exists()))
+    }
+
     /// Returns the domains in this bench's runtime directory.
     pub fn domains(&self) -> Vec<PathBuf> {
         let entries = std::fs::read_dir(self.runtime.path().join("corotate")).into_iter().flatten();

@@ -123,7 +123,7 @@ fn joiners_may_die(joiner: &Joiner, clock: &str, more: &[&str]) {
     let run =
         ["run", file.to_str().unwrap(), "--clock", clock, "--tick-hz=200", "--duration=100000", "--json", "--out=out"];
     let run = bench.start(&[&run[..], &["--set=accept={}", "--set", &still], more].concat());
-    let domain = await_some(|| bench.domains().pop());
+    let domain = bench.await_domain();
     // The first screen appears once ticks run.
     let look = || bench.run(&["watch", domain.to_str().unwrap(), "--once", "1"]);
     await_some(|| look().stdout.contains("running").then_some(()));

@@ -47,7 +47,7 @@ impl Visit {
         let common = ["--duration=100000", "--set=accept={}", "--out=out", "--json", "--clock", clock];
         let run = bench.start(&[&["run", file.to_str().unwrap()][..], &common].concat());
         bench.await_role("controller");
-        let domain = await_some(|| bench.domains().pop());
+        let domain = bench.await_domain();
         let mut config = Config::default();
         config.global.set_root_path(&iceoryx2::prelude::Path::new(domain.to_str().unwrap().as_bytes()).unwrap());
         let id = domain.file_name().unwrap().to_str().unwrap().to_owned();

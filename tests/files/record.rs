@@ -337,7 +337,7 @@ fn a_killed_or_stopped_recorder_does_not_delay_the_run_and_leaves_a_readable_fil
         let fixed =
             ["run", scenario.to_str().unwrap(), "--record", "--out", &out, "--set", "accept={}", "--set", timeout];
         let running = bench.start(&[&fixed[..], &["--clock", clock, "--duration", &duration]].concat());
-        let domain = await_some(|| bench.domains().pop());
+        let domain = bench.await_domain();
         let file = bench.path(&out).join("run.mcap");
         // The recorder has written samples.
         await_some(|| std::fs::metadata(&file).ok().filter(|file| file.len() > 100_000));
@@ -364,7 +364,7 @@ fn a_recorder_that_ends_slowly_is_waited_for() {
     let words = ["run", "rigid-pair", "--record", "--clock", "realtime", "--duration", "2", "--out", "out"];
     let patient = ["--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=60"];
     let running = bench.start(&[&words[..], &patient].concat());
-    let domain = await_some(|| bench.domains().pop());
+    let domain = bench.await_domain();
     let (leader, recorder) = (bench.await_role("leader"), bench.await_role("record"));
     bench.await_ticks("controller");
     send_signal(recorder, SIGSTOP);
@@ -385,7 +385,7 @@ fn a_recorder_that_joins_while_the_loop_waits_for_credit_does_not_block_it() {
     let bench = Bench::new();
     let words = ["run", "rigid-pair", "--clock", "lockstep", "--duration", "20", "--set", "accept={}", "--out", "out"];
     let running = bench.start(&words);
-    let domain = await_some(|| bench.domains().pop());
+    let domain = bench.await_domain();
     bench.await_ticks("controller");
     running.signal(SIGSTOP);
     let mut commits = u64::MAX;
@@ -420,7 +420,7 @@ fn a_recorder_that_joins_late_takes_all_later_samples_within_four_mebibytes() {
         let scenario = shipped("rigid-pair");
         let fixed = ["run", scenario.to_str().unwrap(), "--out", clock, "--set", "accept={}", "--clock", clock];
         let running = bench.start(&[&fixed[..], &["--duration", seconds]].concat());
-        let domain = await_some(|| bench.domains().pop());
+        let domain = bench.await_domain();
         // Waits for a tick with a watcher, which ends before the recorder starts. The watcher lowers the priority of its
         // thread, and the recorder must not inherit that.
         let watch = || {

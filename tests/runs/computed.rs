@@ -110,7 +110,7 @@ fn a_foreign_controller_equals_the_built_in_one_bit_by_bit() {
     for clock in ["lockstep", "realtime"] {
         let running =
             bench.start(&[&["run", "rigid-pair", "--clock", clock, "--external", "controller"], &quick[..]].concat());
-        let domain = await_some(|| bench.domains().pop());
+        let domain = bench.await_domain();
         let seat = await_some(|| {
             let seat = domain.join("controller.seat.json");
             seat.exists().then(|| RoleAddress { domain: domain.clone(), role: "controller".to_owned() })

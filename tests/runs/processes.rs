@@ -177,7 +177,7 @@ fn each_replacement_of_an_external_role_is_an_incident() {
         // On a loaded machine a role may be missing for long.
         let patient = ["--set", "supervision.heartbeat_timeout_s=60", "--external", "follower", "--json"];
         let run = bench.start(&[&["run", file.to_str().unwrap(), "--clock", clock], &endless[..], &patient].concat());
-        let domain = await_some(|| bench.domains().pop());
+        let domain = bench.await_domain();
         let (mut pids, mut last) = (Vec::new(), None);
         for _ in 0..LIVES {
             if let Some(before) = last.take() {
@@ -220,7 +220,7 @@ fn an_external_role_does_not_outlive_a_killed_launcher() {
         let file = shipped("rigid-pair");
         let endless = ["--duration", "100000", "--out", "out", "--set", "accept={}", "--external", "follower"];
         let run = bench.start(&[&["run", file.to_str().unwrap(), "--clock", clock], &endless[..]].concat());
-        let domain = await_some(|| bench.domains().pop());
+        let domain = bench.await_domain();
         let follower = bench.start(&["plant", "--body", "follower", "--domain", domain.to_str().unwrap()]);
         bench.await_ticks("controller");
         run.signal(SIGKILL);
@@ -238,7 +238,7 @@ fn a_recorder_or_watcher_that_joins_at_the_end_does_not_hang() {
     let words = ["run", "rigid-pair", "--clock", "lockstep", "--duration", "20", "--set", "accept={}"];
     for attempt in 0..12 {
         let run = bench.start(&words);
-        let domain = await_some(|| bench.domains().pop());
+        let domain = bench.await_domain();
         // A delay, not a wait: each attempt joins at another point of the run.
         std::thread::sleep(std::time::Duration::from_millis(30 * attempt));
         let domain = domain.to_str().unwrap();

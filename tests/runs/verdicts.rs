@@ -115,7 +115,7 @@ fn a_run_whose_external_controller_is_killed_is_not_accepted() {
     let accept = "--set=accept={sync_error_rad_s_max=100.0}";
     let run = ["run", "rigid-pair", "--clock=realtime", "--tick-hz=200", "--duration=4", "--json", "--out=out"];
     let running = bench.start(&[&run[..], &["--external=controller", accept]].concat());
-    let domain = await_some(|| bench.domains().pop());
+    let domain = bench.await_domain();
     await_some(|| domain.join("controller.seat.json").exists().then_some(()));
     let controller = bench.start(&["controller", "--domain", domain.to_str().unwrap()]);
     bench.await_commits("controller", 100);

@@ -241,7 +241,7 @@ fn a_run_that_is_stopped_is_not_judged() {
     let bench = Bench::new();
     let run = ["run", "inertia", "--duration", "60", "--clock", "realtime", "--tick-hz", "200", "-v"];
     let run = bench.start(&[&run[..], &WITHOUT_TICK_LIMITS].concat());
-    let domain = await_some(|| bench.domains().pop());
+    let domain = bench.await_domain();
     bench.await_role("observer");
     // Without a domain, `watch` and `record` take the newest run.
     let watched = bench.run(&["watch", "--once", "0.5"]);

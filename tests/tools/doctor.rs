@@ -94,8 +94,7 @@ fn an_unprivileged_user_gets_a_report() {
 #[test]
 fn clean_removes_the_files_of_killed_runs_only() {
     let bench = Bench::new();
-    let domain =
-        |bench: &Bench| await_some(|| bench.domains().pop().filter(|path| path.join("scenario.toml").exists()));
+    let domain = Bench::await_domain;
     let killed = bench.start(&["run", "--duration", "60"]);
     let dead = domain(&bench);
     bench.await_role("controller");

@@ -102,7 +102,7 @@ const RUN: [&str; 7] = ["run", "--duration", "60", "--tick-hz", "100", "--set", 
 fn the_screen_shows_the_loop_and_restores_the_terminal() {
     let bench = Bench::new();
     let run = bench.start(&[&RUN[..], &["--json"]].concat());
-    let domain = await_some(|| bench.domains().pop());
+    let domain = bench.await_domain();
     let terminal = Terminal::open(&bench);
     terminal.enter(&format!("{} watch", env!("CARGO_BIN_EXE_corotate")));
 
@@ -169,7 +169,7 @@ fn the_screen_shows_the_loop_and_restores_the_terminal() {
 fn a_signal_restores_the_terminal_and_the_end_of_the_run_is_shown() {
     let bench = Bench::new();
     let run = bench.start(&RUN);
-    let domain = await_some(|| bench.domains().pop());
+    let domain = bench.await_domain();
     let terminal = Terminal::open(&bench);
     let program = env!("CARGO_BIN_EXE_corotate");
     terminal.enter(&format!("{program} watch {}; echo code=$?", domain.display()));
@@ -199,7 +199,7 @@ fn a_signal_restores_the_terminal_and_the_end_of_the_run_is_shown() {
 fn a_watcher_ends_with_its_terminal() {
     let bench = Bench::new();
     let run = bench.start(&RUN);
-    let domain = await_some(|| bench.domains().pop());
+    let domain = bench.await_domain();
     bench.await_role("controller");
     let terminal = Terminal::open(&bench);
     terminal.enter(&format!("{} watch", env!("CARGO_BIN_EXE_corotate")));
@@ -218,7 +218,7 @@ fn a_watcher_ends_with_its_terminal() {
 fn a_killed_watcher_leaves_no_files() {
     let bench = Bench::new();
     let run = bench.start(&RUN);
-    let domain = await_some(|| bench.domains().pop());
+    let domain = bench.await_domain();
     bench.await_role("controller");
     let watcher = bench.start(&["watch", "--once", "60"]);
     let node = || std::fs::read_dir("/proc/self/fd").is_ok() && maps(watcher.pid()).contains("corotate_");
@@ -235,7 +235,7 @@ fn a_killed_watcher_leaves_no_files() {
 fn a_watcher_that_waits_for_a_run_ends_on_sigterm() {
     let bench = Bench::new();
     let run = bench.start(&["run", "--clock", "lockstep", "--external", "observer"]);
-    let domain = await_some(|| bench.domains().pop());
+    let domain = bench.await_domain();
     bench.await_role("controller");
     // A run without its scenario has only just begun, so there is something to wait for.
     let (there, aside) = (domain.join("scenario.toml"), domain.join("aside"));
@@ -258,7 +258,7 @@ fn a_watcher_that_waits_for_a_run_ends_on_sigterm() {
 fn once_prints_a_screen_without_a_terminal() {
     let bench = Bench::new();
     let run = bench.start(&["run", "--duration", "60", "--clock", "realtime", "--tick-hz", "200"]);
-    let domain = await_some(|| bench.domains().pop());
+    let domain = bench.await_domain();
     let done = bench.run(&["watch", domain.to_str().unwrap(), "--once", "3"]).succeeded();
     assert_eq!(done.stdout.lines().count(), 24);
     assert_eq!(line(&done.stdout, "observer")[1], "running", "{}", done.stdout);
