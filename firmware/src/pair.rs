@@ -46,7 +46,7 @@ pub fn law(tick_s: f64) -> Option<RateLaw> {
         supplied: HIDDEN,
         learned: false,
         acceleration_max_rad_s2: ACCELERATION_MAX_RAD_S2,
-        tick_s,
+        period_s: tick_s,
         predicted_ticks: 1,
     }))
 }

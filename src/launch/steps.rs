@@ -185,18 +185,19 @@ impl Steps {
         })
     }
 
-    /// Runs bodies and observer of the next tick, up to the controller's turn. Returns false after the last tick.
+    /// Runs the loop up to the controller's next turn. Returns false after the last tick.
     ///
     /// # Errors
     /// [`LaunchError`].
     pub fn observe(&mut self) -> Result<bool, LaunchError> {
+        while self.tick <= self.scenario.last_tick && !self.tick.is_multiple_of(self.scenario.rates.controller_ticks) {
+            self.run_others()?;
+            self.end_tick()?;
+        }
         if self.tick > self.scenario.last_tick {
             return Ok(false);
         }
-        let controller = self.nodes.len() - 1;
-        for node in &mut self.nodes[..controller] {
-            step(node, self.tick)?;
-        }
+        self.run_others()?;
         for ((reader, order), input) in self.readers.iter_mut().zip(&mut self.inputs) {
             let room = input.take();
             while let Some(words) = reader.next()? {
@@ -212,6 +213,23 @@ impl Steps {
         self.truths.iter_mut().try_for_each(|truth| truth.read(&self.scenario))?;
         self.observed = true;
         Ok(true)
+    }
+
+    /// Runs bodies and observer of the current tick.
+    fn run_others(&mut self) -> Result<(), LaunchError> {
+        let controller = self.nodes.len() - 1;
+        self.nodes[..controller].iter_mut().try_for_each(|node| step(node, self.tick))
+    }
+
+    /// Runs the controller of the current tick, and ends the tick.
+    fn end_tick(&mut self) -> Result<(), LaunchError> {
+        if let Some(controller) = self.nodes.last_mut() {
+            step(controller, self.tick)?;
+        }
+        self.scorer.poll(1)?;
+        self.tick += 1;
+        self.observed = false;
+        Ok(())
     }
 
     /// Returns the state of every body at the current tick.
@@ -278,13 +296,7 @@ impl Steps {
         assert_eq!(commands.len(), given.len(), "one command for each driven body");
         given.iter_mut().zip(commands).for_each(|(given, command)| given.copy_from_slice(command));
         drop(given);
-        if let Some(controller) = self.nodes.last_mut() {
-            step(controller, self.tick)?;
-        }
-        self.scorer.poll(1)?;
-        self.tick += 1;
-        self.observed = false;
-        Ok(())
+        self.end_tick()
     }
 
     /// Changes an input from the tick on that [`observe`](Self::observe) runs next, and returns this tick. A change after the last

@@ -6,4 +6,5 @@ mod identification;
 mod mathematics;
 mod noise;
 mod orbit;
+mod rates;
 mod reference_loop;

@@ -10,7 +10,7 @@ use corotate::scenario::build;
 use serde_json::Value;
 
 /// The tolerance of the columns of `let_pair*.csv`.
-const TOLERANCE: f64 = 1e-9;
+pub(super) const TOLERANCE: f64 = 1e-9;
 
 /// Returns the overrides that turn a shipped scenario into the case of a reference file.
 fn case(file: &str) -> (&'static str, Vec<String>) {
@@ -29,7 +29,7 @@ fn case(file: &str) -> (&'static str, Vec<String>) {
 }
 
 /// Runs a scenario in this thread and returns ω, p, ω̂3 and u per tick, like the reference.
-fn columns(scenario: &Scenario) -> Vec<Vec<f64>> {
+pub(super) fn columns(scenario: &Scenario) -> Vec<Vec<f64>> {
     let bus = MemoryBus::new(depths(scenario));
     let mut nodes: Vec<_> = RoleId::all(scenario)
         .into_iter()

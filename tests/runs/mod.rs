@@ -17,6 +17,7 @@ mod one_plant;
 mod one_process;
 mod own_rig;
 mod processes;
+mod rates;
 mod serial;
 mod served;
 mod timing;

@@ -8,7 +8,7 @@ use crate::bus::Signal;
 use crate::clock::Grid;
 use crate::config::{BodyInfo, Settings};
 use crate::control::WatchBounds;
-use crate::rig::{Estimate, Rig, RigLoopBody, loop_body};
+use crate::rig::{Estimate, Rig, RigLoopBody, loop_body, observer};
 use crate::role::{Guard, Observer, command_index, cycle};
 use crate::runtime::{RoleId, ports};
 use crate::sample::{Message, Stamp};
@@ -79,7 +79,7 @@ impl<'a, R: Rig> Run<'a, R> {
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
             bodies: rig.bodies().iter().enumerate().map(body).collect(),
             judges: (0..rig.bodies().len()).map(judge).collect(),
-            observer: Observer::new(rig.estimator(), scenario.tick_s()),
+            observer: observer(rig, scenario),
             measurement_guard: rig.measurement_guard(0, false),
             estimate: Estimate::<R>::default(),
             estimate_hash: hash(),

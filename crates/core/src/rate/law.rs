@@ -23,8 +23,8 @@ pub struct RateLawDesign {
     pub learned: bool,
     /// The limit of each command component, rad/s²; the actuators reject more.
     pub acceleration_max_rad_s2: f64,
-    /// The period h, s.
-    pub tick_s: f64,
+    /// The time between two commands, s.
+    pub period_s: f64,
     /// The number of ticks over which a predicting law predicts: from a measurement to the tick at which its command
     /// acts.
     pub predicted_ticks: u64,
@@ -40,7 +40,7 @@ pub struct RateLaw {
     supplied: Vector3<f64>,
     learned: bool,
     acceleration_max_rad_s2: f64,
-    tick_s: f64,
+    period_s: f64,
     /// The commands of a predicting law that were sent and do not act yet, rad/s².
     in_flight: InFlightCommands<[f64; 3]>,
 }
@@ -48,8 +48,9 @@ pub struct RateLaw {
 impl RateLaw {
     /// Creates a law that has learned and sent nothing.
     pub fn new(design: &RateLawDesign) -> Self {
-        let RateLawDesign { adaptation_gain, certificate, supplied, learned, acceleration_max_rad_s2, tick_s, .. } =
-            *design;
+        let RateLawDesign {
+            adaptation_gain, certificate, supplied, learned, acceleration_max_rad_s2, period_s, ..
+        } = *design;
         Self {
             law: design.law,
             adaptation: InertiaAdaptation::new(adaptation_gain),
@@ -57,7 +58,7 @@ impl RateLaw {
             supplied: Vector3::from_fn(|row, _| f64::from(u8::from(row == supplied))),
             learned,
             acceleration_max_rad_s2,
-            tick_s,
+            period_s,
             in_flight: InFlightCommands::new(design.predicted_ticks, || [0.0; 3]),
         }
     }
@@ -100,7 +101,7 @@ impl Law for RateLaw {
         }
         let mut asked = self.law.command(&w, &p);
         if self.adaptation.acts() {
-            asked += self.adaptation.correction(&w, &p, self.tick_s);
+            asked += self.adaptation.correction(&w, &p, self.period_s);
         }
         out.acceleration_rad_s2 = limited(asked, self.acceleration_max_rad_s2).into();
         if let Some(sent) = self.in_flight.sent(measurement.stamp.tick) {

@@ -2,7 +2,7 @@
 //!
 //! It must not combine samples of different ticks, and must not see the truth.
 
-use crate::sample::{Message, Sample, Stamp};
+use crate::sample::{Message, Sample};
 use crate::state::{Persist, Words};
 
 /// The most numbers of a loop's reference.
@@ -54,12 +54,13 @@ pub struct Controller<L> {
     reference: [f64; REFERENCE_MAX],
     /// The number of numbers of the reference.
     referred: usize,
+    every_ticks: u64,
 }
 
 impl<L: Law> Controller<L> {
     /// Creates a controller without a reference. `period_s` is the period h in seconds.
     pub fn new(law: L, period_s: f64) -> Self {
-        Self { law, period_s, reference: [0.0; REFERENCE_MAX], referred: 0 }
+        Self { law, period_s, reference: [0.0; REFERENCE_MAX], referred: 0, every_ticks: 1 }
     }
 
     /// Adds the reference at tick 0; numbers beyond [`REFERENCE_MAX`] are left out.
@@ -68,6 +69,18 @@ impl<L: Law> Controller<L> {
         self.referred = reference.len().min(REFERENCE_MAX);
         self.set_reference(0, reference);
         self
+    }
+
+    /// Computes at every n-th tick only. In between the last command is sent again.
+    #[must_use]
+    pub fn every(self, ticks: u64) -> Self {
+        Self { every_ticks: ticks.max(1), ..self }
+    }
+
+    /// Returns true if the controller computes at this tick.
+    #[inline]
+    pub fn is_due(&self, tick: u64) -> bool {
+        self.every_ticks == 1 || tick.is_multiple_of(self.every_ticks)
     }
 
     /// Passes new values of an input to the law.
@@ -87,11 +100,10 @@ impl<L: Law> Controller<L> {
     #[inline(always)]
     pub fn step(&mut self, estimate: &L::Estimate, measurement: &L::Measurement, out: &mut L::Command) {
         debug_assert_eq!(estimate.stamp().tick, measurement.stamp().tick);
-        let Stamp { tick, origin_ns, .. } = *estimate.stamp();
+        let tick = estimate.stamp().tick;
         let reference = &self.reference[..self.referred];
         self.law.command(&LawInputs { tick, period_s: self.period_s, reference, estimate, measurement }, out);
-        let out = out.stamp_mut();
-        (out.tick, out.origin_ns) = (tick, origin_ns);
+        out.stamp_mut().answer(estimate.stamp());
     }
 }
 

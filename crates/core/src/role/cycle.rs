@@ -1,4 +1,5 @@
-//! One tick of a whole loop in one thread: the roles called one after the other, on samples that stay in place.
+//! One tick of a whole loop in one thread: the roles called one after the other, on samples that stay in place. A role that is not due
+//! repeats its last sample.
 //!
 //! It gives the bits of an undisturbed run. It must not judge a sample, nor repeat the computation of a role.
 
@@ -82,16 +83,25 @@ where
     C: AsMut<[B::Command]>,
 {
     let Some(observed) = bodies.first() else { return true };
-    observer.step(&observed.measurement, estimate);
+    if observer.is_due(stamp.tick) {
+        observer.step(&observed.measurement, estimate);
+    } else {
+        estimate.stamp_mut().answer(observed.measurement.stamp());
+    }
     estimate.stamp_mut().generation = stamp.generation;
     let mut all_act = true;
     for LoopBody { plant, measurement, control, .. } in bodies {
         let Some(LoopControl { controller, commands }) = control else { continue };
         let (commands, next) = (commands.as_mut(), stamp.tick + 1);
         let delay_ticks = commands.len();
-        let command = &mut commands[command_index(stamp.tick, delay_ticks)];
-        controller.step(estimate, measurement, command);
-        command.stamp_mut().generation = stamp.generation;
+        let index = command_index(stamp.tick, delay_ticks);
+        if controller.is_due(stamp.tick) {
+            controller.step(estimate, measurement, &mut commands[index]);
+        } else {
+            commands[index] = commands[command_index(stamp.tick.saturating_sub(1), delay_ticks)];
+            commands[index].stamp_mut().answer(estimate.stamp());
+        }
+        commands[index].stamp_mut().generation = stamp.generation;
         let expected = if next < delay_ticks as u64 { CommandEvent::NotDue } else { CommandEvent::Applied };
         all_act &= plant.command(next, Some(&commands[command_index(next, delay_ticks)])) == expected;
     }

@@ -86,12 +86,25 @@ pub struct Observer<E> {
     last: Option<u64>,
     /// The tick of the last estimate.
     last_output: u64,
+    every_ticks: u64,
 }
 
 impl<E: Estimator> Observer<E> {
     /// Creates an observer at its initial guess. `tick_s` is the period h in seconds.
     pub fn new(estimator: E, tick_s: f64) -> Self {
-        Self { estimator, tick_s, last: None, last_output: 0 }
+        Self { estimator, tick_s, last: None, last_output: 0, every_ticks: 1 }
+    }
+
+    /// Computes at every n-th tick only. In between the last estimate is sent again.
+    #[must_use]
+    pub fn every(self, ticks: u64) -> Self {
+        Self { every_ticks: ticks.max(1), ..self }
+    }
+
+    /// Returns true if the observer computes at this tick.
+    #[inline]
+    pub fn is_due(&self, tick: u64) -> bool {
+        self.every_ticks == 1 || tick.is_multiple_of(self.every_ticks)
     }
 
     /// Passes new values of an input to the estimator.
@@ -109,7 +122,7 @@ impl<E: Estimator> Observer<E> {
         let next = self.last.is_some_and(|last| last.checked_add(1) == Some(stamp.tick));
         if next && self.estimator.fast_step(measurement, self.tick_s, out) {
             (self.last, self.last_output) = (Some(stamp.tick), stamp.tick);
-            Self::stamp(stamp, out);
+            out.stamp_mut().answer(stamp);
         } else {
             self.step_any(measurement, out);
         }
@@ -138,14 +151,7 @@ impl<E: Estimator> Observer<E> {
     fn write(&mut self, stamp: &Stamp, status: u64, out: &mut E::Estimate) {
         self.last_output = stamp.tick;
         self.estimator.write(status, out);
-        Self::stamp(stamp, out);
-    }
-
-    #[inline]
-    fn stamp(stamp: &Stamp, out: &mut E::Estimate) {
-        let out = out.stamp_mut();
-        out.tick = stamp.tick;
-        out.origin_ns = stamp.origin_ns;
+        out.stamp_mut().answer(stamp);
     }
 
     fn learn(&mut self, measurement: &E::Measurement) {

@@ -89,6 +89,7 @@ pub struct Plant<B> {
     body: B,
     actuation: Actuation,
     tick_s: f64,
+    substeps: u64,
     missing_ticks: u64,
     safe: bool,
     /// True while a switch demands the safe command.
@@ -106,12 +107,19 @@ impl<B: Body> Plant<B> {
             body,
             actuation,
             tick_s,
+            substeps: 1,
             missing_ticks: 0,
             safe: false,
             demanded_safe: false,
             disconnected: false,
             rejected: false,
         }
+    }
+
+    /// Moves the body over a tick in this number of equal steps.
+    #[must_use]
+    pub fn with_substeps(self, substeps: u64) -> Self {
+        Self { substeps: substeps.max(1), ..self }
     }
 
     /// Returns true if the plant takes commands.
@@ -214,12 +222,17 @@ impl<B: Body> Plant<B> {
         *out.stamp_mut() = *stamp;
     }
 
-    /// Moves the body by `ticks` ticks under the held input. One call of `flow`, so that a process that missed many
-    /// ticks does not miss more by catching up.
+    /// Moves the body by `ticks` ticks under the held input. As many calls of `flow` as for one tick, so that a process that missed
+    /// many ticks does not miss more by catching up.
     #[inline]
     pub fn advance(&mut self, ticks: u64) {
         if ticks > 0 {
-            self.body.flow(ticks as f64 * self.tick_s);
+            let dt_s = ticks as f64 * self.tick_s;
+            if self.substeps == 1 {
+                self.body.flow(dt_s);
+            } else {
+                (0..self.substeps).for_each(|_| self.body.flow(dt_s / self.substeps as f64));
+            }
         }
     }
 

@@ -42,6 +42,12 @@ pub struct Stamp {
 }
 
 impl Stamp {
+    /// Takes tick and origin of the sample to which this one is the answer.
+    #[inline(always)]
+    pub fn answer(&mut self, input: &Self) {
+        (self.tick, self.origin_ns) = (input.tick, input.origin_ns);
+    }
+
     /// The fields, in order.
     pub const FIELDS: [Field; 4] = [
         Self::field("tick", core::mem::offset_of!(Self, tick)),

@@ -2,8 +2,8 @@
 //!
 //! It gives the bits of an undisturbed run. Must not repeat the computation of a role.
 
-use crate::config::Settings;
-use crate::rig::{Command, Estimate, Measurement, Rig, RigLoopBody, Truth, loop_body};
+use crate::config::{Rates, Settings};
+use crate::rig::{Command, Estimate, Measurement, Rig, RigLoopBody, Truth, loop_body, observer};
 use crate::role::{
     Actuation, Guard, LoopBody, LoopControl, Observer, Rearm, SUSPECT_SAMPLES, command_index, cycle, respond,
 };
@@ -19,6 +19,7 @@ pub(super) struct Chain<R: Rig> {
     own: usize,
     observer: Observer<R::Estimator>,
     estimate: Estimate<R>,
+    rates: Rates,
     reference: Vec<f64>,
     /// The controlled fields of the truth, and of the estimate.
     controlled: [Vec<&'static Field>; 2],
@@ -44,7 +45,8 @@ impl<R: Rig> Chain<R> {
             rig: rig.clone(),
             bodies: (0..rig.bodies().len()).map(body).collect(),
             own,
-            observer: Observer::new(rig.estimator(), settings.tick_s()),
+            observer: observer(rig, settings),
+            rates: settings.rates,
             estimate: Default::default(),
             reference: settings.reference.clone(),
             controlled: [controlled::<R, Truth<R>>(), controlled::<R, Estimate<R>>()],
@@ -141,19 +143,16 @@ impl<R: Rig> Chain<R> {
         let LoopBody { plant, control, .. } = &mut self.bodies[self.own];
         plant.persist(visitor);
         self.observer.persist(visitor);
+        if self.rates.observer_ticks > 1 {
+            pass_numbers(&mut self.estimate, visitor);
+        }
         let Some(LoopControl { controller, commands }) = control else { return };
         controller.persist(visitor);
-        // The plant holds the command that acts.
-        for tick in self.tick + 1..self.tick + commands.len() as u64 {
-            let delay_ticks = commands.len();
-            let words = commands[command_index(tick, delay_ticks)].words_mut();
-            for field in numbers::<Command<R>>() {
-                for bits in &mut words[field.offset / 8..][..field.count] {
-                    let mut number = f64::from_bits(*bits);
-                    visitor.number(&mut number);
-                    *bits = number.to_bits();
-                }
-            }
+        let delay_ticks = commands.len();
+        // The plant holds the command that acts. One that is sent again is the last one.
+        let holds_last = self.rates.controller_ticks > 1 && delay_ticks == 1;
+        for tick in self.tick + u64::from(!holds_last)..self.tick + delay_ticks as u64 {
+            pass_numbers(&mut commands[command_index(tick, delay_ticks)], visitor);
         }
     }
 
@@ -213,6 +212,17 @@ impl<R: Rig> Guards<R> {
 /// Returns the fields of a sample that hold numbers.
 fn numbers<S: Sample>() -> impl Iterator<Item = &'static Field> {
     S::FIELDS.iter().filter(|field| field.kind == FieldKind::F64)
+}
+
+/// Passes the numbers of a sample.
+fn pass_numbers<S: Sample, W: Words>(sample: &mut S, visitor: &mut W) {
+    for field in numbers::<S>() {
+        for bits in &mut sample.words_mut()[field.offset / 8..][..field.count] {
+            let mut number = f64::from_bits(*bits);
+            visitor.number(&mut number);
+            *bits = number.to_bits();
+        }
+    }
 }
 
 fn controlled<R: Rig, S: Sample>() -> Vec<&'static Field> {

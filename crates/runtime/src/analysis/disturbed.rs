@@ -65,7 +65,11 @@ impl<R: Rig> Analysis<'_, R> {
         let (mut here, mut measured) = (Vec::new(), Vec::new());
         // The largest magnitudes: of the measured numbers, and of the controlled ones.
         let (mut magnitudes, mut sizes) = (Vec::new(), Vec::new());
-        for _ in 0..self.scenario.last_tick.clamp(1, SCENARIO_TICKS_MAX) {
+        // The disturbed measurement must reach observer and controller.
+        let pattern_ticks = self.scenario.rates.pattern_ticks();
+        let settled = self.scenario.last_tick.clamp(1, SCENARIO_TICKS_MAX).next_multiple_of(pattern_ticks);
+        // The next tick is then a multiple of the pattern.
+        for _ in 0..settled {
             calm.advance();
             disturbed.advance();
             calm.measured(&mut measured);

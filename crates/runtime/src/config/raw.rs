@@ -23,6 +23,8 @@ pub(crate) struct Raw {
     pub seed: u64,
     #[serde(default = "next_tick")]
     pub actuation_delay_ticks: u64,
+    #[serde(default = "one_step", skip_serializing_if = "is_one")]
+    pub substeps: u64,
     #[serde(default)]
     pub record: bool,
     #[serde(default)]
@@ -55,6 +57,14 @@ fn default_seed() -> u64 {
 
 fn next_tick() -> u64 {
     1
+}
+
+fn one_step() -> u64 {
+    1
+}
+
+fn is_one(number: &u64) -> bool {
+    *number == 1
 }
 
 /// The clock that drives the ticks of a run.

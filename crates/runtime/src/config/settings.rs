@@ -5,6 +5,7 @@ use super::body::{BodyInfo, role_names};
 use super::fault::ScriptedFault;
 use super::hosts::Hosts;
 use super::input::Inputs;
+use super::rates::Rates;
 use super::raw::{ClockKind, Realtime, Supervision, Trace};
 use super::run_id::RunId;
 use crate::bus::Port;
@@ -32,6 +33,8 @@ pub struct Settings {
     pub command_timeout_ticks: u64,
     /// The delay from a measurement to the command's effect, ticks.
     pub actuation_delay_ticks: u64,
+    /// The rates of the roles.
+    pub rates: Rates,
     /// The event that ends the safe command.
     pub rearm: Rearm,
     /// The requests of a real-time run to the machine.

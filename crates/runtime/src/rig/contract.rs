@@ -4,8 +4,10 @@
 
 use super::fleet::Fleet;
 use super::pictures::{Picture, graphs};
-use crate::config::{BodyInfo, Checks, ConfigError, Document, InputInfo, Settings};
-use crate::role::{Actuation, Body, Controller, Estimator, Guard, Law, LoopBody, LoopControl, Plant, SingleBody};
+use crate::config::{BodyInfo, Checks, ConfigError, Document, InputInfo, Rates, Settings};
+use crate::role::{
+    Actuation, Body, Controller, Estimator, Guard, Law, LoopBody, LoopControl, Observer, Plant, SingleBody,
+};
 use crate::sample::FleetSample;
 use crate::state::Persist;
 use serde::{Deserialize, Serialize};
@@ -34,12 +36,23 @@ pub fn loop_body<R: Rig>(
         controller: controller(rig.law(index), settings),
         commands: vec![Command::<R>::default(); actuation.delay_ticks as usize],
     });
-    LoopBody::new(Plant::new(rig.body(index), actuation, settings.tick_s()), control)
+    LoopBody::new(plant(rig.body(index), actuation, settings), control)
+}
+
+/// Creates the plant of a body.
+pub fn plant<B: Body>(body: B, actuation: Actuation, settings: &Settings) -> Plant<B> {
+    Plant::new(body, actuation, settings.tick_s()).with_substeps(settings.rates.substeps)
+}
+
+/// Creates the observer of a rig at its initial guess.
+pub fn observer<R: Rig>(rig: &R, settings: &Settings) -> Observer<R::Estimator> {
+    Observer::new(rig.estimator(), settings.tick_s()).every(settings.rates.observer_ticks)
 }
 
 /// Creates the controller of a law with the scenario's reference at tick 0.
 pub fn controller<L: Law>(law: L, settings: &Settings) -> Controller<L> {
-    Controller::new(law, settings.tick_s()).with_reference(&settings.reference)
+    let controller = Controller::new(law, settings.tick_s()).every(settings.rates.controller_ticks);
+    controller.with_reference(&settings.reference)
 }
 
 /// The full state of a rig's fleet.
@@ -306,4 +319,18 @@ pub struct Context {
     pub seed: u64,
     /// The number of ticks from a measurement to the tick at which its command acts.
     pub actuation_delay_ticks: u64,
+    /// The rates of the roles: the controller's period is `controller_ticks` times h.
+    pub rates: Rates,
+}
+
+impl Context {
+    /// Returns the context of a run of 1 s with period `tick_s`, in which every role computes at every tick.
+    pub(crate) fn every_tick(tick_s: f64) -> Self {
+        Self { tick_s, duration_s: 1.0, seed: 1, actuation_delay_ticks: 1, rates: Rates::ALL }
+    }
+
+    /// Returns the time between two commands of the controller, s.
+    pub fn controller_period_s(&self) -> f64 {
+        self.rates.controller_ticks as f64 * self.tick_s
+    }
 }

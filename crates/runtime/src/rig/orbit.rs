@@ -305,7 +305,10 @@ impl Rig for OrbitRig {
     }
 
     fn certificates(&self) -> Vec<CertificateReport> {
-        let Some(controller) = &self.controller else { return Vec::new() };
+        // The certificate is that of roles that compute at every tick.
+        let Some(controller) = self.controller.as_ref().filter(|_| self.rates.pattern_ticks() == 1) else {
+            return Vec::new();
+        };
         // A scenario whose loop cannot be certified was refused.
         self.certificate(controller).map_or(Vec::new(), |certificate| {
             self.driven().map(|index| self.report(index, &controller.law, &certificate)).collect()

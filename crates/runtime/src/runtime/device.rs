@@ -10,7 +10,7 @@ use super::node::ports;
 use super::role_id::RoleId;
 use crate::bus::Port;
 use crate::clock::{monotonic_ns, sleep_until};
-use crate::config::{ClockKind, Settings};
+use crate::config::{ClockKind, Rates, Settings};
 use crate::role::Rearm;
 use crate::sample::{Stamp, type_name_of};
 use crate::serial::{
@@ -164,6 +164,10 @@ impl DeviceLink {
         let body = matches!(roles, [RoleId::Plant(_)]);
         if body && scenario.actuation_delay_ticks > 1 {
             return Err(DeviceError::Delayed { ticks: scenario.actuation_delay_ticks });
+        }
+        let Rates { controller_ticks, observer_ticks, .. } = scenario.rates;
+        if roles.len() > 1 && controller_ticks != observer_ticks {
+            return Err(DeviceError::Rates { controller_ticks, observer_ticks });
         }
         let layouts = Layouts::for_roles(scenario, roles);
         let role = roles.iter().map(|role| role.name(scenario)).collect::<Vec<_>>().join(" ");

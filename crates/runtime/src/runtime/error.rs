@@ -39,6 +39,18 @@ pub enum DeviceError {
         /// The run's delay, ticks.
         ticks: u64,
     },
+    /// The device would take two roles that compute at different rates.
+    #[error(
+        "one device cannot be observer and controller at different rates: observer.every_ticks = {observer_ticks}, \
+         controller.every_ticks = {controller_ticks}; make them equal, or give each role a device of its own"
+    )]
+    #[strum(serialize = "device-rates")]
+    Rates {
+        /// The controller's rate, ticks.
+        controller_ticks: u64,
+        /// The observer's rate, ticks.
+        observer_ticks: u64,
+    },
     /// The device does not answer.
     #[error("the device on {} has not answered for {waited_s:.1} s: {hint}", path.display())]
     #[strum(serialize = "device-silent")]

@@ -8,6 +8,7 @@ mod context;
 mod contract;
 mod controller;
 mod group;
+mod held;
 mod missed;
 mod observer;
 mod persistent;

@@ -24,7 +24,7 @@ use crate::config::hosts::{self, Hosts};
 use crate::config::raw::{Launch, Policy, Raw};
 use crate::config::{
     BodyInfo, Checks, ClockKind, ConfigError, Cores, DISCONNECTED, Document, InputInfo, InputUser, Inputs, NotExternal,
-    Realtime, Settings, Shape, Supervision, Variability, fault, input, nearest, reference, watchdog,
+    Rates, Realtime, Settings, Shape, Supervision, Variability, fault, input, nearest, reference, watchdog,
 };
 use crate::control::{ACTUATION_DELAY_MAX, WatchBounds};
 use crate::rig::Context;
@@ -111,40 +111,44 @@ impl Scenario {
         // Changes are checked by resolving the scenario with their values.
         let without_changes = document.has("input").then(|| document.without("input"));
         document.refuse_lists(&[&registry::tables()[..], &TABLES].concat())?;
+        let rates = Rates::split_off(&mut document, &registry::sections());
         let sections = document.split_off(&registry::sections());
         let maxima: Maxima = document.split_off_within("watchdog", |key| key.ends_with("_max")).read_into()?;
         let metrics = document.split_off_within("accept", |key| !accept::is_common(key));
         let metrics = metrics.read_into::<accept::Metrics>();
         let mut checks = Checks::new(&document);
-        let (raw, metrics) = match (document.read_into::<Raw>(), metrics) {
-            (Ok(raw), Ok(metrics)) => (raw, metrics.accept),
-            (raw, metrics) => {
+        let (raw, metrics, rates) = match (document.read_into::<Raw>(), metrics, rates) {
+            (Ok(raw), Ok(metrics), Ok(rates)) => (raw, metrics.accept, rates),
+            (raw, metrics, rates) => {
                 // The rig's own tables are read too, to report their mistakes, but their values cannot be checked.
-                let context = Context { tick_s: 1.0 / MAX_TICK_HZ, duration_s: 1.0, seed: 0, actuation_delay_ticks: 1 };
+                let context = Context::every_tick(1.0 / MAX_TICK_HZ);
                 let own = document.text("rig").map(|rig| registry::resolve(rig, &sections, context, &mut checks));
                 let rig = own.as_ref().and_then(|own| own.as_ref().ok()?.0.as_deref());
                 let nested = nested_keys(document.text("rig"), rig);
                 checks.retain(|key| key == "rig");
                 let rig_errors = checks.finish::<()>(None).err();
-                let errors = raw.err().map(|error| error.within(&nested)).into_iter().chain(metrics.err());
+                let errors = [raw.err().map(|error| error.within(&nested)), metrics.err(), rates.err()];
+                let errors = errors.into_iter().flatten();
                 let mut errors = errors.chain(own.and_then(Result::err)).chain(rig_errors);
                 let first = errors.next().expect("at least one error");
                 return Err(first.and(errors));
             }
         };
         let mut raw = raw;
+        let rates = Rates { substeps: raw.substeps, ..rates };
         check_common(&raw, &mut checks);
         let period_ns = (1e9 / raw.tick_hz).round() as u64;
         // For a refused tick rate, the rig gets the shortest tick, so that it does not report the same mistake.
         let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 1.0 / MAX_TICK_HZ };
         let length_s = if length_possible(&raw) { raw.duration_s } else { 0.0 };
         let actuation_delay_ticks = raw.actuation_delay_ticks.clamp(1, ACTUATION_DELAY_MAX);
-        let context = Context { tick_s, duration_s: length_s, seed: raw.seed, actuation_delay_ticks };
+        let context = Context { tick_s, duration_s: length_s, seed: raw.seed, actuation_delay_ticks, rates };
         let (rig, rig_table) = match registry::resolve(&raw.rig, &sections, context, &mut checks) {
             Ok(resolved) => resolved,
             Err(error) => return Err(error.and(checks.finish::<()>(None).err())),
         };
         let last_tick = (raw.duration_s * 1e9 / period_ns as f64).round() as u64;
+        rates.check(raw.actuator.command_timeout_ticks, last_tick, &mut checks);
         // A refused length or tick rate leads to no further errors.
         let duration_s = if length_possible(&raw) { raw.duration_s } else { f64::INFINITY };
         let accept = resolve_accept(&raw, &metrics, duration_s, rig.as_deref(), &mut checks);
@@ -188,6 +192,7 @@ impl Scenario {
         let rig = checks.finish(rig)?;
         let mut resolved = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
         resolved.extend(rig_table);
+        rates.write(&mut resolved);
         for (table, keys) in [("watchdog", maxima.watchdog), ("accept", accept.metric_limits())] {
             if let Some(toml::Value::Table(table)) = resolved.get_mut(table) {
                 table.extend(keys.into_iter().map(|(key, max)| (key, toml::Value::Float(max))));
@@ -203,6 +208,7 @@ impl Scenario {
             record: raw.record,
             command_timeout_ticks: raw.actuator.command_timeout_ticks,
             actuation_delay_ticks,
+            rates,
             rearm: raw.actuator.rearm,
             realtime: raw.realtime,
             startup_timeout_s: raw.launch.startup_timeout_s,
@@ -233,7 +239,7 @@ impl Scenario {
             let period_ns = self.period_ns;
             format!("tick_hz {}: a period is a whole number of ns, {period_ns}, so the rate is {real_hz:.9} Hz ({:+.2e} of it)", self.tick_hz, part)
         });
-        rounded.into_iter().chain(self.rig.notes()).collect()
+        rounded.into_iter().chain(self.rates.notes(self.tick_hz)).chain(self.rig.notes()).collect()
     }
 
     /// Returns the text of the scenario file of its run; the first line names the run.

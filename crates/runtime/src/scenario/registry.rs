@@ -63,12 +63,7 @@ pub(crate) fn shapes() -> Vec<(&'static str, Vec<Key>)> {
     let keys_of_rig = |kind: &RigKind, name: &'static str| {
         let sections = Document::asking();
         // The document is empty, so this fails after it has recorded what was asked for.
-        let _ = (kind.resolve)(
-            name,
-            &sections,
-            Context { tick_s: 1e-3, duration_s: 1.0, seed: 1, actuation_delay_ticks: 1 },
-            &mut Checks::new(&sections),
-        );
+        let _ = (kind.resolve)(name, &sections, Context::every_tick(1e-3), &mut Checks::new(&sections));
         let unknown = |name: &&'static str| Key { name, required: false, shape: Shape::Any(None) };
         match sections.asked() {
             Some(Shape::Table { keys, .. }) => (name, keys),

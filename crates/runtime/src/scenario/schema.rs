@@ -38,6 +38,10 @@ pub fn schema(program: &str, shipped: &[(&str, &str)]) -> Value {
         let shape = if shapes.len() == 1 { shapes.remove(0) } else { json!({ "anyOf": shapes }) };
         properties.insert(section.to_owned(), shape);
     }
+    for role in RATED {
+        let alone = || json!({ "properties": { "every_ticks": every_ticks() }, "additionalProperties": false });
+        properties.entry(role).or_insert_with(alone);
+    }
     let required: Vec<&str> = common.iter().filter(|key| key.required).map(|key| key.name).collect();
     let cases: Vec<Value> = rigs.iter().map(|(name, keys)| case(name, keys, &notes)).collect();
     json!({
@@ -67,7 +71,18 @@ fn case(name: &str, keys: &[Key], notes: &Notes) -> Value {
 
 fn of_key(key: &Key, parent: &str, notes: &Notes, rig: Option<&str>) -> Value {
     let path = if parent.is_empty() { key.name.to_owned() } else { format!("{parent}.{}", key.name) };
-    with_note(of_shape(&key.shape, &path, notes, rig), &path, notes, rig)
+    let mut value = with_note(of_shape(&key.shape, &path, notes, rig), &path, notes, rig);
+    if RATED.contains(&&*path) {
+        value["properties"]["every_ticks"] = every_ticks();
+    }
+    value
+}
+
+/// The tables of a rig that also hold the role's rate.
+const RATED: [&str; 2] = ["controller", "observer"];
+
+fn every_ticks() -> Value {
+    json!({ "type": "integer", "minimum": 1 })
 }
 
 fn of_shape(shape: &Shape, path: &str, notes: &Notes, rig: Option<&str>) -> Value {

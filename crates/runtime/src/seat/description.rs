@@ -39,6 +39,8 @@ pub struct SeatDescription {
     /// Number of ticks that a plant may run ahead of the credit in lockstep.
     window_ticks: u64,
     /// Number of ticks from a measurement until its command acts.
+    /// The role computes at every n-th tick, from tick 0 on.
+    every_ticks: u64,
     actuation_delay_ticks: u64,
     command_timeout_ticks: u64,
     rearm: &'static str,
@@ -176,6 +178,11 @@ pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>)
         period_ns: scenario.period_ns,
         last_tick: scenario.last_tick,
         window_ticks: window_ticks(scenario),
+        every_ticks: match role {
+            RoleId::Controller => scenario.rates.controller_ticks,
+            RoleId::Observer => scenario.rates.observer_ticks,
+            RoleId::Plant(_) => 1,
+        },
         actuation_delay_ticks: scenario.actuation_delay_ticks,
         command_timeout_ticks: scenario.command_timeout_ticks,
         rearm: match scenario.rearm {

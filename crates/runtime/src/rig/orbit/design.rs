@@ -2,7 +2,7 @@
 
 use super::limits::Limits;
 use super::roles::Aim;
-use crate::config::BodyInfo;
+use crate::config::{BodyInfo, Rates};
 use crate::control::{OrbitGains, OrbitHold};
 use crate::model::{CentralField, Noise, OrbitState};
 use crate::rig::filter::FilterDesign;
@@ -24,6 +24,7 @@ pub struct OrbitRig {
     pub(super) disturbances_du_s2: Vec<Vector2<f64>>,
     pub(super) limits: Limits,
     pub(super) tick_s: f64,
+    pub(super) rates: Rates,
 }
 
 /// The law of the driven bodies.

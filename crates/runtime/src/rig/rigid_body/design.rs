@@ -3,7 +3,7 @@
 use super::limits::Limits;
 use super::plant::Outage;
 use super::playback::Playback;
-use crate::config::BodyInfo;
+use crate::config::{BodyInfo, Rates};
 use crate::control::Certificate;
 use crate::model::{Inertia, Noise};
 use crate::observe::HiddenRate;
@@ -45,6 +45,7 @@ pub struct RigidBodyRig {
     pub(super) notes: Vec<String>,
     pub(super) tick_s: f64,
     pub(super) actuation_delay_ticks: u64,
+    pub(super) rates: Rates,
     /// The certificate of every follower: followers differ in nothing that it depends on.
     pub(super) certificate: Option<Certificate>,
 }

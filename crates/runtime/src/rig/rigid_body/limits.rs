@@ -134,15 +134,15 @@ impl Limits {
         }
     }
 
-    /// Creates a guard for estimates of a body whose |a| are at most `coefficients`.
-    pub fn estimate(&self, coefficients: &Vector3<f64>, tick_s: f64) -> EstimateGuard {
+    /// Creates a guard for estimates of a body whose |a| are at most `coefficients`, computed at every n-th tick.
+    pub fn estimate(&self, coefficients: &Vector3<f64>, tick_s: f64, every_ticks: u64) -> EstimateGuard {
         let free = coefficients * (self.estimate_rad_s * self.estimate_rad_s);
         let corrected = Vector3::repeat(self.correction_per_s * 2.0 * self.estimate_rad_s);
         let bounds = Bounds {
             magnitude: [self.estimate_rad_s; 3],
-            slew_per_tick: ((free + corrected) * tick_s).into(),
+            slew_per_tick: ((free + corrected) * (tick_s * every_ticks as f64)).into(),
             allowance: [0.0; 3],
-            repeats: self.repeats,
+            repeats: self.repeats.saturating_mul(every_ticks),
         };
         EstimateGuard { rate: PlausibilityCheck::new(bounds) }
     }
@@ -396,7 +396,7 @@ mod tests {
     #[test]
     fn an_incomplete_estimate_is_accepted_only_with_its_reason() {
         let estimate = |valid, status| RateEstimate { valid, status, ..RateEstimate::default() };
-        let mut guard = LIMITS.estimate(&Vector3::repeat(1.0), 1e-3);
+        let mut guard = LIMITS.estimate(&Vector3::repeat(1.0), 1e-3, 1);
         assert!(guard.accepts(&estimate(ALL, 0)) && guard.accepts(&estimate(0b011, status::INITIAL)));
         assert!(!guard.accepts(&estimate(0b011, 0)));
         assert!(!guard.accepts(&RateEstimate { omega_rad_s: [0.0, 3.1, 0.0], ..estimate(ALL, 0) }));
@@ -411,10 +411,10 @@ mod tests {
             let stamp = Stamp { tick, generation: 1, ..Stamp::default() };
             RateEstimate { stamp, omega_rad_s: [rate; 3], valid: ALL, ..RateEstimate::default() }
         };
-        let mut guard = limits.estimate(&Vector3::repeat(0.5), 1e-3);
+        let mut guard = limits.estimate(&Vector3::repeat(0.5), 1e-3, 1);
         assert!(guard.accepts(&estimate(0, 0.0)) && !guard.accepts(&estimate(1, 1.01e-3 * slew)));
         assert!(guard.accepts(&estimate(1, 0.99e-3 * slew)));
-        let mut loose = LIMITS.estimate(&Vector3::repeat(0.5), 1e-3);
+        let mut loose = LIMITS.estimate(&Vector3::repeat(0.5), 1e-3, 1);
         assert!(loose.accepts(&estimate(0, 0.0)) && loose.accepts(&estimate(1, 3.0)));
     }
 

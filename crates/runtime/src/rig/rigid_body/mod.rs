@@ -91,7 +91,8 @@ impl RigidBodyRig {
                 )
             });
         }
-        if let Some(controller) = self.controller {
+        // A slower controller is judged by the loop that runs.
+        if let Some(controller) = self.controller.filter(|_| self.rates.controller_ticks == 1) {
             let step = Certificate::gain_step(&controller.gain_per_s, tick_s, self.unpredicted_ticks(&controller));
             checks.require(step.holds(), "controller.gain_per_s", "unstable-loop", || {
                 format!(
@@ -145,8 +146,8 @@ impl RigidBodyRig {
 
     fn certify(&self) -> Option<Certificate> {
         let controller = self.controller?;
-        // The certificate applies to leaders that move freely.
-        if self.playback.is_some() {
+        // The certificate applies to leaders that move freely, and to roles that compute at every tick.
+        if self.playback.is_some() || self.rates.pattern_ticks() > 1 {
             return None;
         }
         // The papers' conditions apply to the papers' filter.
@@ -305,7 +306,7 @@ impl Rig for RigidBodyRig {
             supplied: self.supplied(),
             learned: controller.learned,
             acceleration_max_rad_s2: self.limits.acceleration_rad_s2,
-            tick_s: self.tick_s,
+            period_s: self.tick_s * self.rates.controller_ticks as f64,
             predicted_ticks: self.predicted_ticks(&controller),
         })
     }
@@ -316,7 +317,7 @@ impl Rig for RigidBodyRig {
     }
 
     fn estimate_guard(&self) -> EstimateGuard {
-        self.limits.estimate(&self.leader_coefficients(), self.tick_s)
+        self.limits.estimate(&self.leader_coefficients(), self.tick_s, self.rates.observer_ticks)
     }
 
     fn command_guard(&self, _index: usize) -> CommandGuard {

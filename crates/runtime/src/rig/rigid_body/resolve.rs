@@ -69,6 +69,7 @@ pub(super) fn resolve(
         notes,
         tick_s: context.tick_s,
         actuation_delay_ticks: context.actuation_delay_ticks,
+        rates: context.rates,
         certificate: None,
     };
     rig.certificate = rig.certify();

@@ -1,6 +1,7 @@
 //! The controller's links to a driven body or fleet.
 
 use super::context::NodeContext;
+use super::held::{Held, repeat};
 use super::missed::MissedTicks;
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
@@ -57,6 +58,7 @@ pub struct Channel<L: Law<Measurement: Carried, Command: Carried>, G, B: Bus> {
     controller: Controller<L>,
     pub measurement: Input<B, L::Measurement, G>,
     pub command: Output<B, L::Command>,
+    held: Held<L::Command>,
     /// True while the measurement of the current tick is available and a command will be sent.
     pub ready: bool,
     /// Start of the current command's computation, and its sending, ns; 0 if no command was sent.
@@ -75,8 +77,9 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     ) -> Result<Self, BusError> {
         let measurement = context.input(body, Signal::Measurement, guard)?;
         let controller = controller(law, context.scenario);
+        let held = Held::new(context.scenario.rates.controller_ticks, body.bodies());
         let missed = MissedTicks::default();
-        Ok(Self { body: index, controller, measurement, command, ready: false, began_ns: 0, sent_ns: 0, missed })
+        Ok(Self { body: index, controller, measurement, command, held, ready: false, began_ns: 0, sent_ns: 0, missed })
     }
 
     pub fn state<W: Words>(&mut self, words: &mut W)
@@ -85,6 +88,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         G: Persist,
     {
         self.controller.persist(words);
+        self.held.persist(words);
         self.measurement.persist(words);
         self.command.persist_late(words);
     }
@@ -206,21 +210,34 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         starved: &mut bool,
         computed: Option<(&SampleSource, usize)>,
     ) -> Result<u64, NodeError> {
-        *starved |= !self.ready;
+        let tick = estimate.stamp().tick;
+        let due = self.controller.is_due(tick);
+        *starved |= due && !self.ready;
         if silent {
             // The watchdog suppresses the command: it does not count as missed.
-            let _ = self.missed.before(estimate.stamp().tick);
+            let _ = self.missed.before(tick);
         }
-        self.ready &= !silent && computed.is_none_or(|(source, index)| source.has(index));
-        let Some(measurement) = self.measurement.sample().filter(|_| self.ready) else {
-            self.command.stage_marker(estimate.stamp().tick);
+        self.ready = !silent
+            && match due {
+                true => self.ready && computed.is_none_or(|(source, index)| source.has(index)),
+                false => self.held.at(tick).is_some(),
+            };
+        let measurement = self.measurement.sample().filter(|_| self.ready && due);
+        if !self.ready || due && measurement.is_none() {
+            self.command.stage_marker(tick);
             return Ok(began_ns);
-        };
-        let (controller, sent_ns) = (&mut self.controller, &mut self.sent_ns);
+        }
+        let (controller, held, sent_ns) = (&mut self.controller, &mut self.held, &mut self.sent_ns);
         self.command.stage(|sample| {
-            controller.step(estimate, measurement, sample);
-            if let Some((source, index)) = computed {
-                source.write(index, sample.words_mut());
+            match measurement {
+                None => held.at(tick).into_iter().for_each(|held| repeat(held, estimate.stamp(), sample)),
+                Some(measurement) => {
+                    controller.step(estimate, measurement, sample);
+                    if let Some((source, index)) = computed {
+                        source.write(index, sample.words_mut());
+                    }
+                    held.keep(sample);
+                }
             }
             *sent_ns = clock.now_ns();
             sample.stamp_mut().sent_ns = *sent_ns;

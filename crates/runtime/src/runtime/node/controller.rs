@@ -35,6 +35,7 @@ pub struct ControllerNode<R: Rig, B: Bus> {
     ledger: Ledger,
     /// The source of the commands, if not the laws.
     source: Option<SampleSource>,
+    every_ticks: u64,
     /// The channel, counted over bodies and fleets, that the next idle poll reads.
     look: usize,
     stages: Stages,
@@ -69,6 +70,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             inputs: context.inputs(|user| matches!(user, InputUser::Law(_) | InputUser::Reference)),
             ledger: context.ledger.reopened(),
             source,
+            every_ticks: context.scenario.rates.controller_ticks,
             look: 0,
             stages: Stages {
                 late_ns: context.scenario.realtime.late_ns(context.scenario.period_ns),
@@ -212,7 +214,8 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         if self.interruptions.misses(stamp.tick) {
             return self.miss(stamp.tick);
         }
-        if let Some(source) = &mut self.source {
+        let due = stamp.tick.is_multiple_of(self.every_ticks);
+        if let Some(source) = self.source.as_mut().filter(|_| due) {
             let estimate = std::iter::once(self.estimate.sample().map(Message::words));
             match source.tick(stamp.tick, estimate.chain(self.channels.iter().map(AnyChannel::words)))? {
                 Progress::Done => {

@@ -2,12 +2,13 @@
 
 use super::context::{LOOK_NS, NodeContext};
 use super::contract::{Node, Poll, RunCondition};
+use super::held::{Held, repeat};
 use super::missed::MissedTicks;
 use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::config::InputUser;
-use crate::rig::{Estimate, Measurement, Rig};
+use crate::rig::{Estimate, Measurement, Rig, observer};
 use crate::role::Observer;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::error::NodeError;
@@ -36,6 +37,7 @@ pub struct ObserverNode<R: Rig, B: Bus> {
     observer: Observer<R::Estimator>,
     measurement: Input<B, Measurement<R>, R::MeasurementGuard>,
     estimate: Output<B, Estimate<R>>,
+    held: Held<Estimate<R>>,
     clock: Clock,
     counters: TickCounters,
     interruptions: Interruptions,
@@ -56,9 +58,10 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         let leader = &rig.bodies()[0];
         let estimate = context.output(leader, Signal::Estimate)?;
         Ok(Self {
-            observer: Observer::new(rig.estimator(), context.scenario.tick_s()),
+            observer: observer(rig, context.scenario),
             measurement: context.input(leader, Signal::Measurement, rig.measurement_guard(0, false))?,
             estimate,
+            held: Held::new(context.scenario.rates.observer_ticks, 1),
             clock: context.clock,
             counters: TickCounters::default(),
             interruptions: context.interruptions(),
@@ -82,7 +85,8 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         if self.interruptions.misses(stamp.tick) {
             return self.miss(stamp.tick);
         }
-        if let Some(source) = &mut self.source {
+        let due = self.observer.is_due(stamp.tick);
+        if let Some(source) = self.source.as_mut().filter(|_| due) {
             match source.tick(stamp.tick, [measurement.map(Message::words)].into_iter())? {
                 Progress::Done => received = source.asked_ns(stamp.tick).unwrap_or(received),
                 Progress::Waiting => return Ok(Poll::Waiting),
@@ -100,15 +104,22 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
             let observer = &mut self.observer;
             self.inputs.advance(stamp.tick, |new| observer.set_input(new.by.port, new.values));
         }
-        let (observer, source, clock) = (&mut self.observer, &self.source, self.clock);
+        if !due && self.held.at(stamp.tick).is_none() {
+            return self.pass_over();
+        }
+        let (observer, source, held, clock) = (&mut self.observer, &self.source, &mut self.held, self.clock);
         let mut done = 0;
         self.estimate.stage(|sample| {
             match measurement {
+                _ if !due => held.at(stamp.tick).into_iter().for_each(|held| repeat(held, &stamp, sample)),
                 Some(measurement) => observer.step(measurement, sample),
                 None => observer.reject(&stamp, sample),
             }
-            if let Some(source) = source {
-                source.write(0, sample.words_mut());
+            if due {
+                if let Some(source) = source {
+                    source.write(0, sample.words_mut());
+                }
+                held.keep(sample);
             }
             done = clock.now_ns();
             sample.stamp_mut().sent_ns = done;
@@ -314,6 +325,7 @@ impl<R: Rig, B: Bus> Persistent for ObserverNode<R, B> {
     #[inline]
     fn state<W: Words>(&mut self, words: &mut W) {
         self.observer.persist(words);
+        self.held.persist(words);
         self.measurement.persist(words);
         self.estimate.persist_late(words);
     }

@@ -7,7 +7,7 @@ use super::persistent::{Inherited, Persistent, commit, commit_last, length, rest
 use crate::bus::{Bus, BusError, Carried, Reader, Signal};
 use crate::clock::{Clock, Grid};
 use crate::config::{DISCONNECTED, InputUser};
-use crate::rig::{BodyInfo, DelayLine, Due};
+use crate::rig::{BodyInfo, DelayLine, Due, plant};
 use crate::role::{Body, CommandEvent, Guard, Plant};
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::error::NodeError;
@@ -75,7 +75,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         let command = info.driven.then(|| context.input_of(info, Signal::Command, guard, reader)).transpose()?;
         let line = (delayed && info.driven).then(|| DelayLine::new(delay_ticks, || P::Command::blank(bodies)));
         Ok(Self {
-            plant: Plant::new(body, scenario.actuation(info.driven), scenario.tick_s()),
+            plant: plant(body, scenario.actuation(info.driven), scenario),
             command,
             line,
             command_fields: P::Command::fields(bodies),
