@@ -94,16 +94,25 @@ where
         let Some(LoopControl { controller, commands }) = control else { continue };
         let (commands, next) = (commands.as_mut(), stamp.tick + 1);
         let delay_ticks = commands.len();
-        let index = command_index(stamp.tick, delay_ticks);
-        if controller.is_due(stamp.tick) {
-            controller.step(estimate, measurement, &mut commands[index]);
-        } else {
-            commands[index] = commands[command_index(stamp.tick.saturating_sub(1), delay_ticks)];
-            commands[index].stamp_mut().answer(estimate.stamp());
+        if !controller.is_due(stamp.tick) {
+            repeat_last(commands, stamp.tick);
         }
-        commands[index].stamp_mut().generation = stamp.generation;
+        let command = &mut commands[command_index(stamp.tick, delay_ticks)];
+        if controller.is_due(stamp.tick) {
+            controller.step(estimate, measurement, command);
+        } else {
+            command.stamp_mut().answer(estimate.stamp());
+        }
+        command.stamp_mut().generation = stamp.generation;
         let expected = if next < delay_ticks as u64 { CommandEvent::NotDue } else { CommandEvent::Applied };
         all_act &= plant.command(next, Some(&commands[command_index(next, delay_ticks)])) == expected;
     }
     all_act
+}
+
+/// Copies the command of the tick before this one.
+#[cold]
+fn repeat_last<C: Copy>(commands: &mut [C], tick: u64) {
+    let delay_ticks = commands.len();
+    commands[command_index(tick, delay_ticks)] = commands[command_index(tick.saturating_sub(1), delay_ticks)];
 }

@@ -231,9 +231,16 @@ impl<B: Body> Plant<B> {
             if self.substeps == 1 {
                 self.body.flow(dt_s);
             } else {
-                (0..self.substeps).for_each(|_| self.body.flow(dt_s / self.substeps as f64));
+                self.advance_in_steps(dt_s);
             }
         }
+    }
+
+    /// Not inlined, so that the usual way has one call of `flow`.
+    #[cold]
+    #[inline(never)]
+    fn advance_in_steps(&mut self, dt_s: f64) {
+        (0..self.substeps).for_each(|_| self.body.flow(dt_s / self.substeps as f64));
     }
 
     /// Moves the body over the `ticks` ticks before `tick` that were not executed: no command arrived, so the
