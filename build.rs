@@ -1,5 +1,5 @@
-//! Notes what the program is made of, for its summaries and `--version`: the source revision and the target. Without git, and
-//! outside a package that says it, the revision is `unknown`.
+//! Notes what the program is made of, for its summaries and `--version`: the source revision and the target. The revision is that of
+//! the variable COROTATE_REVISION, of the package, or of git, and else `unknown`.
 
 use std::path::Path;
 use std::process::Command;
@@ -9,12 +9,14 @@ const SOURCES: [&str; 7] = ["build.rs", "Cargo.toml", "Cargo.lock", "bin", "conf
 
 fn main() {
     // A package may lie in another repository.
-    let revision = packaged().or_else(|| git(&["describe", "--always", "--dirty", "--abbrev=12"]));
+    let given = std::env::var("COROTATE_REVISION").ok().filter(|revision| !revision.is_empty());
+    let revision = given.or_else(packaged).or_else(|| git(&["describe", "--always", "--dirty", "--abbrev=12"]));
     let revision = revision.unwrap_or("unknown".to_owned());
     let target = std::env::var("TARGET").unwrap_or("unknown".to_owned());
     for (name, value) in [("REVISION", revision), ("TARGET", target)] {
         println!("cargo::rustc-env=COROTATE_{name}={value}");
     }
+    println!("cargo::rerun-if-env-changed=COROTATE_REVISION");
     SOURCES.iter().for_each(|path| println!("cargo::rerun-if-changed={path}"));
     // Commits and checkouts. Not the index, which `git status` may rewrite; and only what is there,
     // or all would be built again every time.

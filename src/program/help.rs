@@ -21,7 +21,7 @@ const FIRST: [&str; 10] = ["run", "check", "init", "new", "report", "watch", "re
 const TEMPLATE: &str = "{about}\n\n{usage-heading} {usage}{after-help}";
 const OPTIONS: &str = "\
 `COMMAND --help` explains a command, with examples; `COMMAND -h` is shorter.
--V prints the version, --version details. All take --color auto|always|never.
+-V prints version and revision, --version more. All take --color auto|always|never.
 Exit codes: 0 ok, 1 failure, 2 usage or configuration, 3 not accepted or not
 equal, 4 process died, 5 privilege not granted, 128+n ended by signal n";
 
@@ -56,10 +56,12 @@ Example:
 /// Returns the definition of the command line, complete with version and help.
 pub fn line(definition: clap::Command) -> clap::Command {
     let line = named(definition);
-    let version = format!("{}\n{}", version(), about_build());
+    let short = format!("{} ({})", version(), env!("COROTATE_REVISION"));
+    let long = format!("{short}\n{}", about_build());
     let overview = overview(&line) + OPTIONS;
     // Leaked once: the process parses one command line.
-    line.long_version(&*version.leak()).help_template(TEMPLATE).after_help(overview).color(asked_color())
+    let line = line.version(&*short.leak()).long_version(&*long.leak());
+    line.help_template(TEMPLATE).after_help(overview).color(asked_color())
 }
 
 /// Returns the definition with the program's name and version, equal on every machine.

@@ -2,6 +2,7 @@
 
 mod damage;
 mod directories;
+mod earlier;
 mod junit;
 mod own_data;
 #[cfg(feature = "parquet")]
