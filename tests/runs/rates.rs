@@ -4,6 +4,9 @@ use super::own_rig;
 use crate::common::Bench;
 use serde_json::Value;
 
+/// Both bodies measure their rates at ticks of their own.
+const SENSORS: &str = r#"sensor=[{body="leader",field="omega_rad_s",every_ticks=4},{body="follower",field="omega_rad_s",every_ticks=3,phase_ticks=1}]"#;
+
 fn run(bench: &Bench, scenario: &str, clock: &str, set: &[&str]) -> Value {
     let mut line = vec!["run", scenario, "--clock", clock, "--duration", "1.5", "--record", "--overwrite", "--json"];
     line.extend(["--out", clock, "--set", "accept={}"]);
@@ -21,6 +24,15 @@ fn every_clock_and_replay_give_one_hash() {
         ("rigid-trio", &["controller.every_ticks=7", "substeps=3"]),
         ("orbit-hold", &["controller.every_ticks=10", "observer.every_ticks=2"]),
         ("noisy-pair", &["controller.every_ticks=2", "substeps=2"]),
+        ("rigid-pair", &[SENSORS]),
+        ("noisy-pair", &[SENSORS, "controller.every_ticks=3", "observer.every_ticks=2"]),
+        ("gyro-loss", &[r#"sensor=[{body="leader",field="omega_rad_s",every_ticks=5}]"#]),
+        (
+            "orbit-hold",
+            &[
+                r#"sensor=[{body="spacecraft",field="radius_du",every_ticks=4},{body="spacecraft",field="angle_rad",every_ticks=6}]"#,
+            ],
+        ),
         ("rigid-fleet", &["controller.every_ticks=5", "follower.0.count=3"]),
     ] {
         let expected = run(&bench, scenario, "in-process", set);
@@ -45,13 +57,18 @@ fn every_clock_and_replay_give_one_hash() {
 #[test]
 fn a_kill_costs_no_bit() {
     let bench = Bench::new();
-    let set = ["controller.every_ticks=5", "observer.every_ticks=2", "actuation_delay_ticks=2"];
-    let expected = run(&bench, "rigid-pair", "in-process", &set)["state"]["hash"].clone();
+    for set in [&["controller.every_ticks=5", "observer.every_ticks=2", "actuation_delay_ticks=2"][..], &[SENSORS]] {
+        kill_each(&bench, set);
+    }
+}
+
+fn kill_each(bench: &Bench, set: &[&str]) {
+    let expected = run(bench, "rigid-pair", "in-process", set)["state"]["hash"].clone();
     for role in ["leader", "follower", "observer", "controller"] {
         for tick in [500, 501, 504] {
             let kill = format!("fault=[{{kind=\"kill\",role=\"{role}\",from_tick={tick}}}]");
             for clock in ["in-process", "lockstep"] {
-                let killed = run(&bench, "rigid-pair", clock, &[&set[..], &[&kill]].concat());
+                let killed = run(bench, "rigid-pair", clock, &[set, &[&kill]].concat());
                 assert_eq!(killed["incidents"].as_array().unwrap().len(), 1);
                 assert_eq!(killed["state"]["hash"], expected, "{role} at {tick}, {clock}");
             }
@@ -85,6 +102,12 @@ fn the_rates_of_a_rig_of_ones_own_need_no_tables_of_the_rig() {
     let checked = bench.run(&["check", "motor-pair", "--resolved", "--set", set[0], "--set", set[1]]).succeeded();
     std::fs::write(bench.path("resolved.toml"), &checked.stdout).unwrap();
     let again = run(&bench, bench.path("resolved.toml").to_str().unwrap(), "in-process", &[]);
+    let set = [
+        r#"sensor=[{body="leader",field="speed_rad_s",every_ticks=4},{body="follower",field="speed_rad_s",every_ticks=2}]"#,
+    ];
+    let [sensed, lockstep] = ["in-process", "lockstep"].map(|clock| run(&bench, "motor-pair", clock, &set));
+    assert_eq!(sensed["state"]["hash"], lockstep["state"]["hash"]);
+    assert_ne!(sensed["state"]["hash"], expected["state"]["hash"]);
     assert_eq!(again["state"]["hash"], expected["state"]["hash"]);
 }
 
@@ -99,10 +122,26 @@ fn impossible_rates_are_refused() {
         ("controller.every_ticks=2.5", "wrong-type"),
         ("controller.every_tick=2", "unknown-key"),
         ("leader.every_ticks=2", "unknown-key"),
+        (r#"sensor=[{body="leader",field="omega_rad_s",every_ticks=0}]"#, "out-of-range"),
+        (r#"sensor=[{body="leader",field="omega_rad_s",every_ticks=3,phase_ticks=3}]"#, "out-of-range"),
+        (r#"sensor=[{body="leader",field="omega_rad_s",every_ticks=-1}]"#, "wrong-type"),
+        (r#"sensor=[{body="leader",field="omega_rad_s"}]"#, "missing-key"),
+        (r#"sensor=[{body="leader",field="omega_rad_s",every_tick=2}]"#, "unknown-key"),
+        (r#"sensor=[{body="nobody",field="omega_rad_s",every_ticks=2}]"#, "unknown-body"),
+        (r#"sensor=[{body="leader",field="omega",every_ticks=2}]"#, "unknown-field"),
+        (r#"sensor=[{body="leader",field="status",every_ticks=2}]"#, "unknown-field"),
+        (r#"sensor=[{body="leader",field="tick",every_ticks=2}]"#, "unknown-field"),
+        (
+            r#"sensor=[{body="leader",field="omega_rad_s",every_ticks=2},{body="leader",field="omega_rad_s",every_ticks=3}]"#,
+            "given-twice",
+        ),
     ] {
         let done = bench.run(&["check", "rigid-pair", "--set", set]);
         assert!(done.code == Some(2) && done.says(code), "{set}: {done:?}");
     }
+    let fleet = r#"sensor=[{body="fleet",field="omega_rad_s",every_ticks=2}]"#;
+    let done = bench.run(&["check", "rigid-fleet", "--set", fleet]);
+    assert!(done.code == Some(2) && done.says("fleet-sensor"), "{done:?}");
     let own = Bench::with_program(own_rig::program());
     let done = own.run(&["check", "motor-pair", "--set", "controller.every_tick=2"]);
     assert!(done.code == Some(2) && done.says("unknown-key"), "{done:?}");

@@ -13,7 +13,7 @@ use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::Grid;
 use crate::config::{Accept, ChangeLists, InputInfo, InputUser, Settings, set_point_of};
 use crate::input::Shape;
-use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth, field_named};
+use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth};
 use crate::role::Guard;
 use crate::runtime::{AcceptedTicks, Input, LateSamples, NewValue, RoleInputs, Seek, topic};
 use crate::sample::{Message, Sample, Stamp, status};
@@ -156,15 +156,6 @@ struct DrivenBody {
     before: Option<(u64, f64, f64)>,
 }
 
-/// Returns the status bits of a sample, 0 if its type has no field `status`.
-#[inline]
-fn status_of<S: Sample>(sample: &S) -> u64 {
-    match const { field_named(S::FIELDS, "status") } {
-        Some(index) => sample.words()[S::FIELDS[index].offset / size_of::<u64>()],
-        None => 0,
-    }
-}
-
 /// Returns an element of a numeric field of a sample.
 fn number<S: Sample>(sample: &S, name: &str, element: usize) -> Option<f64> {
     let field = S::FIELDS.iter().find(|field| field.name == name && element < field.count)?;
@@ -185,7 +176,7 @@ impl Statuses {
     /// Counts the status bits of a sample. Most samples have none.
     #[inline]
     fn take<S: Sample>(&mut self, sample: &S) {
-        let bits = status_of(sample);
+        let bits = sample.status();
         if bits != 0 {
             let counts = self.counts.iter_mut().zip(status::NAMES);
             counts.for_each(|(count, (_, bit))| *count += u64::from(bits & bit != 0));
@@ -396,7 +387,7 @@ impl<R: Rig> Scoring<R> {
         let per_body = truths.iter_mut().enumerate();
         per_body.for_each(|(body, statuses)| truth(body).iter().for_each(|truth| statuses.take(*truth)));
         // The certificate cannot be judged from an estimate without information.
-        let seen = estimate.filter(|estimate| status_of(*estimate) & BLIND == 0);
+        let seen = estimate.filter(|estimate| estimate.status() & BLIND == 0);
         for driven in &mut self.driven {
             let (observed, own) = (truth(0), truth(driven.body));
             let now = match (observed, own, seen) {

@@ -172,6 +172,30 @@ impl<const N: usize> PlausibilityCheck<N> {
         self.accepts_any(stamp, values, valid, change)
     }
 
+    /// Like [`accepts_within`](Self::accepts_within) for a sample in which the components selected by the bits of `held` repeat an
+    /// earlier value. These must be possible too, but count neither as repetitions nor as the start of the next change.
+    #[cold]
+    pub fn accepts_held(
+        &mut self,
+        stamp: &Stamp,
+        values: &[f64; N],
+        (valid, held): (u64, u64),
+        change: impl Fn(&Bounds<N>, usize, &[f64; N], f64) -> f64,
+    ) -> bool {
+        self.store_current_ticks();
+        for i in (0..N).filter(|i| (valid & held) >> i & 1 == 1) {
+            if !self.in_range(i, values[i]) {
+                self.refusal = Refusal::of_values(&[values[i]]);
+                return false;
+            }
+            if !self.can_reach(i, values[i], stamp.tick, &change) {
+                self.refusal = Refusal::TooFast;
+                return false;
+            }
+        }
+        self.accepts_any(stamp, values, valid & !held, change)
+    }
+
     /// The general path, not inlined so that the fast path saves no registers for it.
     #[inline(never)]
     fn accepts_any(
@@ -185,7 +209,7 @@ impl<const N: usize> PlausibilityCheck<N> {
         let counts = self.bounds.repeats != u64::MAX;
         let mut refusal = None;
         for (i, &value) in values.iter().enumerate() {
-            if counts {
+            if counts && valid >> i & 1 == 1 {
                 self.repeated[i] = if value == self.before[i] { self.repeated[i] + 1 } else { 0 };
             }
             if valid >> i & 1 == 0 || refusal.is_some() {
@@ -347,6 +371,22 @@ impl<const N: usize> MotionCheck<N> {
         self.next_tick = tick + 1;
         let moved = from.iter().zip(&self.next).map(|(from, next)| (next - from) * (next - from)).sum::<f64>();
         self.path = if restart { 0.0 } else { self.path } + libm::sqrt(moved);
+        self.samples > SUSPECT_SAMPLES
+    }
+}
+
+impl<const N: usize> MotionCheck<N> {
+    /// Moves the prediction over a tick whose values are not new. Returns true if the motion has been consistent for long enough
+    /// before. Call it only while the check is [active](Self::active).
+    pub fn coast(&mut self, tick: u64, flow: impl FnOnce(&[f64; N]) -> [f64; N]) -> bool {
+        if tick != self.next_tick {
+            self.stop();
+            return false;
+        }
+        let next = flow(&self.next);
+        let moved = self.next.iter().zip(&next).map(|(from, next)| (next - from) * (next - from)).sum::<f64>();
+        self.path += libm::sqrt(moved);
+        (self.next, self.next_tick) = (next, tick + 1);
         self.samples > SUSPECT_SAMPLES
     }
 }

@@ -17,6 +17,11 @@ pub trait Estimator {
     fn usable(&self, measurement: &Self::Measurement) -> bool {
         measurement.finite()
     }
+    /// Returns true if a measurement has a new value of every field that an update needs. Otherwise the estimate coasts. By default all
+    /// fields must be new; an estimator that updates with some of them overrides this and asks [`Sample::holds`].
+    fn is_new(&self, measurement: &Self::Measurement) -> bool {
+        !measurement.is_held()
+    }
     /// Discards the past and starts at the configured guess, with `measurement` as the first. By default an update over 0 s.
     fn start(&mut self, measurement: &Self::Measurement) {
         self.update(measurement, 0.0);
@@ -120,7 +125,7 @@ impl<E: Estimator> Observer<E> {
     pub fn step(&mut self, measurement: &E::Measurement, out: &mut E::Estimate) {
         let stamp = measurement.stamp();
         let next = self.last.is_some_and(|last| last.checked_add(1) == Some(stamp.tick));
-        if next && self.estimator.fast_step(measurement, self.tick_s, out) {
+        if next && !measurement.is_held() && self.estimator.fast_step(measurement, self.tick_s, out) {
             (self.last, self.last_output) = (Some(stamp.tick), stamp.tick);
             out.stamp_mut().answer(stamp);
         } else {
@@ -131,13 +136,18 @@ impl<E: Estimator> Observer<E> {
     /// The general path, not inlined so that the fast path saves no registers for it.
     #[inline(never)]
     fn step_any(&mut self, measurement: &E::Measurement, out: &mut E::Estimate) {
-        let status = if self.estimator.usable(measurement) {
-            self.learn(measurement);
+        let status = if !self.estimator.usable(measurement) {
+            status::UNUSABLE
+        } else if !self.estimator.is_new(measurement) {
+            status::HELD
+        } else {
             0
+        };
+        if status == 0 {
+            self.learn(measurement);
         } else {
             self.coast(measurement.stamp().tick);
-            status::UNUSABLE
-        };
+        }
         self.write(measurement.stamp(), status, out);
     }
 

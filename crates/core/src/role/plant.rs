@@ -24,6 +24,10 @@ pub trait Body {
     fn truth(&self, status: u64, out: &mut Self::Truth);
     /// Writes the measurement of a tick with the given status bits, but not the stamp. Called once per executed tick.
     fn measure(&mut self, tick: u64, status: u64, out: &mut Self::Measurement);
+    /// Replaces the fields of a measurement whose sensors have no new value at this tick. Called after
+    /// [`measure`](Self::measure).
+    #[inline(always)]
+    fn hold(&mut self, _tick: u64, _out: &mut Self::Measurement) {}
     /// Moves the body by `dt_s` seconds under the held input.
     fn flow(&mut self, dt_s: f64);
     /// Takes new values of an input of the loop, such as a disturbance, from this tick on. `port` is the number that the rig gave
@@ -210,8 +214,16 @@ impl<B: Body> Plant<B> {
     /// Writes the measurement of the current state under the given stamp.
     #[inline]
     pub fn measure(&mut self, stamp: &Stamp, out: &mut B::Measurement) {
+        self.measure_with(stamp, out, |_| {});
+    }
+
+    /// Does the same with values that `replace` writes, before slower sensors hold theirs.
+    #[inline]
+    pub fn measure_with(&mut self, stamp: &Stamp, out: &mut B::Measurement, replace: impl FnOnce(&mut B::Measurement)) {
         let status = self.status();
         self.body.measure(stamp.tick, status, out);
+        replace(out);
+        self.body.hold(stamp.tick, out);
         *out.stamp_mut() = *stamp;
     }
 

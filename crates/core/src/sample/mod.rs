@@ -7,16 +7,19 @@
 mod applied;
 #[cfg(feature = "std")]
 mod definition;
+mod field;
 mod fleet;
 mod layout;
 mod orbit;
 mod order;
 mod rigid;
 mod run;
+pub mod status;
 
 pub use applied::Applied;
 #[cfg(feature = "std")]
 pub use definition::{CDR_HEADER, Column, Layout, MESSAGE_ENCODING, SCHEMA_ENCODING, frame, topic_of};
+pub use field::{Field, FieldKind, FieldType, field_named, is_number, same_name};
 pub use fleet::{
     CommandLayout, FleetCommand, FleetLayout, FleetMeasurement, FleetSample, FleetTruth, MeasurementLayout, TruthLayout,
 };
@@ -75,51 +78,6 @@ impl Stamp {
 /// place. Readers count it and treat the tick like one whose sample was lost. Real time does not need it.
 pub const NO_SAMPLE: u64 = 1 << 63;
 
-/// The type of a field's elements.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum FieldKind {
-    /// Unsigned 64-bit integer.
-    U64,
-    /// IEEE 754 double.
-    F64,
-}
-
-/// The location of one field in a sample.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Field {
-    /// The name; the unit is its last part.
-    pub name: &'static str,
-    /// The offset from the start of the sample, bytes.
-    pub offset: usize,
-    /// The type of the elements.
-    pub kind: FieldKind,
-    /// The number of elements: 1 for a scalar.
-    pub count: usize,
-}
-
-/// A type permitted as a sample's field: 8-byte elements, so that natural alignment leaves no padding.
-pub trait FieldType {
-    /// The type of the elements.
-    const KIND: FieldKind;
-    /// The number of elements.
-    const COUNT: usize;
-}
-
-impl FieldType for u64 {
-    const KIND: FieldKind = FieldKind::U64;
-    const COUNT: usize = 1;
-}
-
-impl FieldType for f64 {
-    const KIND: FieldKind = FieldKind::F64;
-    const COUNT: usize = 1;
-}
-
-impl<T: FieldType, const N: usize> FieldType for [T; N] {
-    const KIND: FieldKind = T::KIND;
-    const COUNT: usize = N * T::COUNT;
-}
-
 /// Data of any length that a link carries: words of 8 bytes, a stamp at the start.
 pub trait Message: core::fmt::Debug + Send + Sync {
     /// Returns the stamp.
@@ -150,6 +108,31 @@ pub trait Sample: Message + bytemuck::Pod + Default + PartialEq {
     /// layouts.
     const LAYOUT: &'static str = Self::LAYOUT_NAME.as_str();
 
+    /// The index of the word `status`, counted from the begin of the stamp; `None` if the sample has no such field.
+    const STATUS_WORD: Option<usize> = match field_named(Self::FIELDS, "status") {
+        Some(index) => Some(Self::FIELDS[index].offset / 8),
+        None => None,
+    };
+
+    /// Returns the status bits; 0 if the sample has no field `status`.
+    #[inline(always)]
+    fn status(&self) -> u64 {
+        Self::STATUS_WORD.map_or(0, |word| self.words()[word])
+    }
+
+    /// Returns true if a sensor has no new value at this tick: at least one field holds an earlier one.
+    #[inline(always)]
+    fn is_held(&self) -> bool {
+        self.status() & status::HELD != 0
+    }
+
+    /// Returns true if the field of this name holds an earlier value: its sensor has no new one at this tick.
+    /// False for an unknown name.
+    #[inline]
+    fn holds(&self, name: &str) -> bool {
+        self.is_held() && field_named(Self::FIELDS, name).is_some_and(|field| self.status() & status::held(field) != 0)
+    }
+
     /// Returns true if all floating-point fields are finite.
     fn finite(&self) -> bool {
         let words = self.words();
@@ -175,12 +158,6 @@ pub trait Sample: Message + bytemuck::Pod + Default + PartialEq {
 /// Returns the length of a sample's content, bytes.
 pub const fn content_length<S: Sample>() -> usize {
     size_of::<S>() - size_of::<Stamp>()
-}
-
-/// Returns true if a word of a sample, counted from the begin of its stamp, is part of a field of `f64`.
-pub fn is_number(fields: &[Field], word: usize) -> bool {
-    let covers = |field: &&Field| (field.offset / 8..field.offset / 8 + field.count).contains(&word);
-    fields.iter().find(covers).is_some_and(|field| field.kind == FieldKind::F64)
 }
 
 /// Copies every field of `from` into the field of `to` with the same name, type and length, if there is one. The
@@ -280,50 +257,6 @@ macro_rules! sample {
     };
 }
 pub use crate::sample;
-
-/// The bits of a sample's status word.
-pub mod status {
-    /// The plant received no command for this tick in time and holds the last one.
-    pub const HOLDING: u64 = 1 << 0;
-    /// The plant applies its safe command.
-    pub const SAFE: u64 = 1 << 1;
-    /// The estimate is the configured guess: nothing has been observed yet.
-    pub const INITIAL: u64 = 1 << 2;
-    /// The motion carried no information about the unknown since the last sample: the estimate advanced by the model
-    /// alone.
-    pub const UNOBSERVABLE: u64 = 1 << 3;
-    /// The measurement lacked a required component or was not finite. The estimate advanced by the model alone, or
-    /// stayed if the model is still being learned.
-    pub const UNUSABLE: u64 = 1 << 4;
-    /// The observer learns the body's inertia while all components are measured.
-    pub const LEARNING: u64 = 1 << 5;
-    /// The observer supplies a component that is not measured any more.
-    pub const AXIS_LOST: u64 = 1 << 6;
-    /// The component was lost before the inertia had been learned: the estimate is bounded but not reliable.
-    pub const DEGRADED: u64 = 1 << 7;
-    /// The motion does not excite the identifier.
-    pub const NOT_EXCITED: u64 = 1 << 8;
-    /// The body reached a limit of its model (a collision or an escape) and is frozen at its last valid state.
-    pub const FAULT: u64 = 1 << 9;
-    /// The input of this tick arrived but was not accepted: not finite, of an impossible generation, or physically
-    /// impossible. It is treated as missing.
-    pub const REJECTED: u64 = 1 << 10;
-
-    /// All bits with their names.
-    pub const NAMES: [(&str, u64); 11] = [
-        ("holding", HOLDING),
-        ("safe", SAFE),
-        ("initial", INITIAL),
-        ("unobservable", UNOBSERVABLE),
-        ("unusable", UNUSABLE),
-        ("learning", LEARNING),
-        ("axis_lost", AXIS_LOST),
-        ("degraded", DEGRADED),
-        ("not_excited", NOT_EXCITED),
-        ("fault", FAULT),
-        ("rejected", REJECTED),
-    ];
-}
 
 #[cfg(test)]
 mod tests {

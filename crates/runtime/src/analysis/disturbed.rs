@@ -65,7 +65,7 @@ impl<R: Rig> Analysis<'_, R> {
         let (mut here, mut measured) = (Vec::new(), Vec::new());
         // The largest magnitudes: of the measured numbers, and of the controlled ones.
         let (mut magnitudes, mut sizes) = (Vec::new(), Vec::new());
-        // The disturbed measurement must reach observer and controller.
+        // A disturbed measurement must reach observer and controller, and every sensor be disturbed.
         let pattern_ticks = self.scenario.rates.pattern_ticks();
         let settled = self.scenario.last_tick.clamp(1, SCENARIO_TICKS_MAX).next_multiple_of(pattern_ticks);
         // The next tick is then a multiple of the pattern.
@@ -77,8 +77,10 @@ impl<R: Rig> Analysis<'_, R> {
             keep_largest(&mut magnitudes, &measured);
             keep_largest(&mut sizes, &here);
         }
-        calm.advance();
-        disturbed.advance_disturbed(DISTURBANCE, &magnitudes);
+        for _ in 0..pattern_ticks {
+            calm.advance();
+            disturbed.advance_disturbed(DISTURBANCE, &magnitudes);
+        }
         let scales: Vec<f64> = sizes.iter().map(|size| if *size > 0.0 { *size } else { 1.0 }).collect();
         let size = (scales.len() as f64).sqrt();
         self.exponent_between(LoopPair { reference: calm, near: disturbed, free: Free::Unknown(None), scales, size })

@@ -95,7 +95,15 @@ pub(crate) fn of_rig<R: Rig>(rig: &R, scenario: &Settings) -> Vec<Claim> {
 
 impl<R: Rig> Analysis<'_, R> {
     fn claim(&self, body: &str, certificate: Option<&CertificateReport>) -> Claim {
+        let pattern_ticks = self.scenario.rates.pattern_ticks();
         let (rate, floors) = match self.rig.isolated(self.index, Start::Settled, false) {
+            _ if pattern_ticks > SCENARIO_TICKS_MAX => (
+                Err(format!(
+                    "roles and sensors repeat their pattern only after {pattern_ticks} ticks, more than the analysis \
+                     examines; choose rates with a smaller common multiple"
+                )),
+                Vec::new(),
+            ),
             None => panics::catch_quietly(|| self.rate_by_running()).unwrap_or_else(|panic| {
                 (Err(format!("the analysis runs the rig's own code, and {panic}")), Vec::new())
             }),

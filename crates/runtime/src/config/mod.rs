@@ -16,6 +16,7 @@ pub(crate) mod raw;
 mod reader;
 pub(crate) mod reference;
 mod run_id;
+pub(crate) mod sensor;
 mod settings;
 mod shape;
 pub(crate) mod watchdog;
@@ -33,6 +34,7 @@ pub use rates::Rates;
 pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Trace, Wake};
 pub(crate) use reader::keys_of;
 pub use run_id::{NoRunId, RunId};
+pub use sensor::Sensor;
 pub use settings::{NotExternal, Settings};
 pub(crate) use shape::{Key, Shape};
 

@@ -3,21 +3,23 @@
 //!
 //! The tables `controller` and `observer` also hold the keys of a rig. This file must not know these.
 
+use super::sensor::{EVERY_MAX, common_multiple};
 use super::{Checks, ConfigError, Document};
 use serde::Deserialize;
 use toml::Table;
 
-/// The slowest rate of a role, ticks, and the most steps of a tick.
-const EVERY_MAX: u64 = 100_000;
+/// The most steps of a tick.
 const SUBSTEPS_MAX: u64 = 10_000;
 
-/// The rates of the roles. Bodies measure and move at every tick.
+/// The rates of the roles. Bodies move at every tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Rates {
     /// The controller computes at every n-th tick, from tick 0 on; in between it sends the last commands again.
     pub controller_ticks: u64,
     /// The same for the observer and its estimate.
     pub observer_ticks: u64,
+    /// The ticks after which the pattern of all sensors repeats; 1 if all measure at every tick.
+    pub sensor_ticks: u64,
     /// The number of equal steps in which a body moves over a tick.
     pub substeps: u64,
 }
@@ -49,7 +51,7 @@ fn every_tick() -> u64 {
 
 impl Rates {
     /// Every role computes at every tick.
-    pub const ALL: Self = Self { controller_ticks: 1, observer_ticks: 1, substeps: 1 };
+    pub const ALL: Self = Self { controller_ticks: 1, observer_ticks: 1, sensor_ticks: 1, substeps: 1 };
 
     /// Moves the keys of the rates out of a scenario. `rig_tables` are the tables whose other keys belong to a rig.
     ///
@@ -104,13 +106,14 @@ impl Rates {
         }
     }
 
-    /// Returns the ticks after which the pattern of the roles repeats.
+    /// Returns the ticks after which the pattern of roles and sensors repeats.
     pub fn pattern_ticks(self) -> u64 {
-        let (mut a, mut b) = (self.controller_ticks, self.observer_ticks);
-        while b != 0 {
-            (a, b) = (b, a % b);
-        }
-        self.controller_ticks / a * self.observer_ticks
+        common_multiple(self.controller_ticks, self.update_ticks())
+    }
+
+    /// Returns a bound on the ticks between two corrections of the estimate, if every one of them needs all sensors.
+    pub fn update_ticks(self) -> u64 {
+        common_multiple(self.observer_ticks, self.sensor_ticks)
     }
 
     /// Returns a sentence about each role that does not compute at every tick.

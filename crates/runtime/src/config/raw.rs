@@ -6,6 +6,7 @@ use super::fault::RawFault;
 use super::hosts::{Host, Network};
 use super::input::RawInput;
 use super::reference::RawReferences;
+use super::sensor::Sensor;
 use crate::role::Rearm;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -47,6 +48,8 @@ pub(crate) struct Raw {
     pub fault: Vec<RawFault>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub input: Vec<RawInput>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub sensor: Vec<Sensor>,
     #[serde(default, skip_serializing_if = "RawReferences::is_empty")]
     pub reference: RawReferences,
 }

@@ -8,6 +8,7 @@ use super::input::Inputs;
 use super::rates::Rates;
 use super::raw::{ClockKind, Realtime, Supervision, Trace};
 use super::run_id::RunId;
+use super::sensor::Sensor;
 use crate::bus::Port;
 use crate::control::WatchBounds;
 use crate::role::{Actuation, Rearm};
@@ -35,6 +36,8 @@ pub struct Settings {
     pub actuation_delay_ticks: u64,
     /// The rates of the roles.
     pub rates: Rates,
+    /// The sensors that are slower than the tick.
+    pub sensors: Vec<Sensor>,
     /// The event that ends the safe command.
     pub rearm: Rearm,
     /// The requests of a real-time run to the machine.

@@ -4,6 +4,7 @@
 
 use super::fleet::Fleet;
 use super::pictures::{Picture, graphs};
+use super::sensors::SensedBody;
 use crate::config::{BodyInfo, Checks, ConfigError, Document, InputInfo, Rates, Settings};
 use crate::role::{
     Actuation, Body, Controller, Estimator, Guard, Law, LoopBody, LoopControl, Observer, Plant, SingleBody,
@@ -22,7 +23,7 @@ pub type Estimate<R> = <<R as Rig>::Estimator as Estimator>::Estimate;
 pub type Command<R> = <<R as Rig>::Body as Body>::Command;
 
 /// A body of a rig's loop in one thread.
-pub type RigLoopBody<R> = LoopBody<<R as Rig>::Body, <R as Rig>::Law, Vec<Command<R>>>;
+pub type RigLoopBody<R> = LoopBody<SensedBody<<R as Rig>::Body>, <R as Rig>::Law, Vec<Command<R>>>;
 
 /// Creates a body of a loop in one thread, at its initial state; `controlled` adds its controller.
 pub fn loop_body<R: Rig>(
@@ -36,7 +37,12 @@ pub fn loop_body<R: Rig>(
         controller: controller(rig.law(index), settings),
         commands: vec![Command::<R>::default(); actuation.delay_ticks as usize],
     });
-    LoopBody::new(plant(rig.body(index), actuation, settings), control)
+    LoopBody::new(plant(sensed_body(rig, index, settings), actuation, settings), control)
+}
+
+/// Creates a single body with its sensors, at its initial state.
+pub fn sensed_body<R: Rig>(rig: &R, index: usize, settings: &Settings) -> SensedBody<R::Body> {
+    SensedBody::new(rig.body(index), settings, &rig.bodies()[index].name)
 }
 
 /// Creates the plant of a body.

@@ -10,13 +10,14 @@ mod fleet;
 mod orbit;
 mod pictures;
 mod rigid_body;
+mod sensors;
 mod simple;
 mod words;
 
 pub use crate::config::BodyInfo;
 pub use contract::{
     CertificateReport, Command, ConditionReport, Context, Estimate, Figure, FleetCommand, FleetMeasurement, FleetTruth,
-    Measurement, Monitor, Rig, RigLoopBody, Start, Truth, Watched, controller, loop_body, observer, plant,
+    Measurement, Monitor, Rig, RigLoopBody, Start, Truth, Watched, controller, loop_body, observer, plant, sensed_body,
 };
 pub use delay::{DelayLine, Due};
 pub use fleet::{Fleet, NoFleet};
@@ -24,7 +25,7 @@ pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
 pub use pictures::named;
 pub use pictures::{Graph, Inputs, Lyapunov, Picture, Plane, Point, graphs};
 pub use rigid_body::{RateLaw, RigidBodyRig};
-pub(crate) use simple::field_named;
+pub use sensors::{SensedBody, Sensors};
 pub use simple::{Bounded, Difference, SimpleRig};
 pub use words::{WordGuard, WordView};
 

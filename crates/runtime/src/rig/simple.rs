@@ -6,7 +6,7 @@ use super::{BodyInfo, Context, Estimate, FleetTruth, Measurement, Monitor, NoFle
 use crate::config::{Checks, ConfigError, Document, InputInfo, keys_of};
 use crate::input::COMPONENTS_MAX;
 use crate::role::{Body, Estimator, Guard, Law, REFERENCE_MAX, Refusal, SingleBody};
-use crate::sample::{Field, FieldKind, Message, Sample};
+use crate::sample::{Field, FieldKind, Message, Sample, field_named, same_name};
 use crate::state::{Persist, Words};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -245,7 +245,7 @@ impl Difference {
 const fn lists(names: &[&str], name: &str) -> bool {
     let mut index = 0;
     while index < names.len() {
-        if same(names[index].as_bytes(), name.as_bytes()) {
+        if same_name(names[index], name) {
             return true;
         }
         index += 1;
@@ -259,26 +259,6 @@ const fn has(fields: &[Field], name: &str) -> bool {
         Some(index) => matches!(fields[index].kind, FieldKind::F64),
         None => false,
     }
-}
-
-/// Returns the index of the field with this name. Usable at compile time.
-pub(crate) const fn field_named(fields: &[Field], name: &str) -> Option<usize> {
-    let mut index = 0;
-    while index < fields.len() {
-        if same(fields[index].name.as_bytes(), name.as_bytes()) {
-            return Some(index);
-        }
-        index += 1;
-    }
-    None
-}
-
-const fn same(a: &[u8], b: &[u8]) -> bool {
-    let mut index = 0;
-    while index < a.len() && index < b.len() && a[index] == b[index] {
-        index += 1;
-    }
-    index == a.len() && index == b.len()
 }
 
 /// Returns the numbers of a sample's field.

@@ -33,7 +33,7 @@ use crate::changes::ReceivedChanges;
 use crate::clock::Clock;
 use crate::config::{ClockKind, Settings};
 use crate::control::Watchdog;
-use crate::rig::{Fleet, Rig};
+use crate::rig::{Fleet, Rig, sensed_body};
 use crate::state::{Persist, StoredWords};
 use crate::telemetry::{Grant, Ledger, LedgerError, ReadCounters, RoleReport, StageReport, TickCounters, WatchReport};
 use context::{extent, words};
@@ -201,7 +201,8 @@ fn role_node<R: Rig, B: Bus + 'static>(
                         Some(SampleSource::Function(function)) => Some(function),
                         Some(SampleSource::Device(_)) | None => None,
                     };
-                    Box::new(PlantNode::open(rig.body(index), rig.command_guard(index), info, context, function)?)
+                    let body = sensed_body(rig, index, context.scenario);
+                    Box::new(PlantNode::open(body, rig.command_guard(index), info, context, function)?)
                 }
                 Some(fleet) => Box::new(PlantNode::open(fleet.body(), fleet.command_guard(), info, context, None)?),
             }

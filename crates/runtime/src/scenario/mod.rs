@@ -24,7 +24,7 @@ use crate::config::hosts::{self, Hosts};
 use crate::config::raw::{Launch, Policy, Raw};
 use crate::config::{
     BodyInfo, Checks, ClockKind, ConfigError, Cores, DISCONNECTED, Document, InputInfo, InputUser, Inputs, NotExternal,
-    Rates, Realtime, Settings, Shape, Supervision, Variability, fault, input, nearest, reference, watchdog,
+    Rates, Realtime, Settings, Shape, Supervision, Variability, fault, input, nearest, reference, sensor, watchdog,
 };
 use crate::control::{ACTUATION_DELAY_MAX, WatchBounds};
 use crate::rig::Context;
@@ -135,7 +135,7 @@ impl Scenario {
             }
         };
         let mut raw = raw;
-        let rates = Rates { substeps: raw.substeps, ..rates };
+        let rates = Rates { substeps: raw.substeps, sensor_ticks: sensor::common_ticks(&raw.sensor), ..rates };
         check_common(&raw, &mut checks);
         let period_ns = (1e9 / raw.tick_hz).round() as u64;
         // For a refused tick rate, the rig gets the shortest tick, so that it does not report the same mistake.
@@ -171,6 +171,8 @@ impl Scenario {
                 seed: raw.seed,
                 actuation_delay_ticks,
             };
+            sensor::check(&raw.sensor, rig.bodies(), &signals, last_tick, &mut checks);
+            sensor::check_together(&raw.sensor, bodies[0].0, rates.observer_ticks, &mut checks);
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
             inputs.infos = rig.inputs();
             inputs.infos.extend(actuator_switches(&raw, rig.bodies()));
@@ -209,6 +211,7 @@ impl Scenario {
             command_timeout_ticks: raw.actuator.command_timeout_ticks,
             actuation_delay_ticks,
             rates,
+            sensors: raw.sensor,
             rearm: raw.actuator.rearm,
             realtime: raw.realtime,
             startup_timeout_s: raw.launch.startup_timeout_s,
@@ -239,7 +242,12 @@ impl Scenario {
             let period_ns = self.period_ns;
             format!("tick_hz {}: a period is a whole number of ns, {period_ns}, so the rate is {real_hz:.9} Hz ({:+.2e} of it)", self.tick_hz, part)
         });
-        rounded.into_iter().chain(self.rates.notes(self.tick_hz)).chain(self.rig.notes()).collect()
+        rounded
+            .into_iter()
+            .chain(self.rates.notes(self.tick_hz))
+            .chain(sensor::notes(&self.sensors, self.tick_hz))
+            .chain(self.rig.notes())
+            .collect()
     }
 
     /// Returns the text of the scenario file of its run; the first line names the run.

@@ -8,7 +8,7 @@ use crate::model::{CentralField, OrbitState};
 use crate::rig::Figure;
 use crate::rig::filter::SURE_DEVIATIONS;
 use crate::role::{Bounds, Guard, PlausibilityCheck, Refusal};
-use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, status};
+use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, Sample, status};
 use crate::state::persist_fields;
 use nalgebra::Vector4;
 use serde::{Deserialize, Serialize};
@@ -150,6 +150,17 @@ impl Limits {
 
 persist_fields!(MeasurementGuard, state);
 
+impl MeasurementGuard {
+    /// Checks the motion of a sample in which a field repeats an earlier value.
+    #[cold]
+    fn accepts_held(&mut self, sample: &OrbitMeasurement, state: &[f64; 4]) -> bool {
+        let fields = [("radius_du", 0b1), ("angle_rad", 0b10), ("velocity_du_s", 0b1100)];
+        let held = fields.into_iter().filter(|(name, _)| sample.holds(name)).map(|(_, bits)| bits).sum();
+        let (limits, valid) = (self.limits, sample.valid);
+        self.state.accepts_held(&sample.stamp, state, (valid, held), |_, i, from, ticks| limits.change(i, from, ticks))
+    }
+}
+
 impl Guard<OrbitMeasurement> for MeasurementGuard {
     #[inline]
     fn accepts(&mut self, sample: &OrbitMeasurement) -> bool {
@@ -159,9 +170,12 @@ impl Guard<OrbitMeasurement> for MeasurementGuard {
         sample.valid & self.needed == self.needed
             && sample.applied_du_s2.iter().all(|thrust| thrust.abs() <= limits.thrust_du_s2 * (1.0 + ROUNDING))
             && placed
-            && self
-                .state
-                .accepts_within(&sample.stamp, &state, sample.valid, |_, i, from, ticks| limits.change(i, from, ticks))
+            && if sample.is_held() {
+                self.accepts_held(sample, &state)
+            } else {
+                let change = |_: &Bounds<4>, i: usize, from: &[f64; 4], ticks: f64| limits.change(i, from, ticks);
+                self.state.accepts_within(&sample.stamp, &state, sample.valid, change)
+            }
     }
 
     fn refusal(&self, sample: &OrbitMeasurement) -> Refusal {

@@ -8,7 +8,7 @@ use crate::rate::ALL;
 use crate::rig::Figure;
 use crate::rig::filter::SURE_DEVIATIONS;
 use crate::role::{Bounds, Guard, MotionCheck, PlausibilityCheck, Refusal};
-use crate::sample::{RateCommand, RateEstimate, RateMeasurement, status};
+use crate::sample::{RateCommand, RateEstimate, RateMeasurement, Sample, status};
 use crate::state::persist_fields;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
@@ -198,10 +198,12 @@ impl Motion {
             pursuit.stop();
             return false;
         }
+        pursuit.is_consistent(tick, rate, &bounds.allowance, |from| self.flow(from, applied))
+    }
+
+    fn flow(&self, from: &[f64; 3], applied: &[f64; 3]) -> [f64; 3] {
         let applied = Vector3::from(*applied).component_div(&self.factor);
-        pursuit.is_consistent(tick, rate, &bounds.allowance, |from| {
-            self.body.flow(&Vector3::from(*from), &applied, self.tick_s).into()
-        })
+        self.body.flow(&Vector3::from(*from), &applied, self.tick_s).into()
     }
 }
 
@@ -219,6 +221,29 @@ pub struct MeasurementGuard {
 persist_fields!(MeasurementGuard, rate, pursuit);
 
 impl MeasurementGuard {
+    /// Checks the rates of a sample in which a field repeats an earlier value.
+    #[cold]
+    fn accepts_held(&mut self, sample: &RateMeasurement) -> bool {
+        if !sample.holds("omega_rad_s") {
+            return self.accepts_new(sample);
+        }
+        if let (true, Some(motion)) = (self.pursuit.active(), self.motion) {
+            return self.pursuit.coast(sample.stamp.tick, |from| motion.flow(from, &sample.applied_rad_s2));
+        }
+        let change = |bounds: &Bounds<3>, i: usize, _: &[f64; 3], ticks: f64| bounds.slew_per_tick[i] * ticks;
+        self.rate.accepts_held(&sample.stamp, &sample.omega_rad_s, (sample.valid, ALL), change)
+    }
+
+    #[inline]
+    fn accepts_new(&mut self, sample: &RateMeasurement) -> bool {
+        if self.rate.accepts(&sample.stamp, &sample.omega_rad_s, sample.valid) {
+            self.pursuit.stop();
+            true
+        } else {
+            (self.pursuit.active() || !self.rate.contains(&sample.omega_rad_s)) && self.follows(sample)
+        }
+    }
+
     /// Checks a sample that is out of range, or follows such a sample.
     #[cold]
     fn follows(&mut self, sample: &RateMeasurement) -> bool {
@@ -237,12 +262,7 @@ impl Guard<RateMeasurement> for MeasurementGuard {
     fn accepts(&mut self, sample: &RateMeasurement) -> bool {
         sample.valid & self.needed == self.needed
             && within(&sample.applied_rad_s2, self.acceleration_rad_s2)
-            && if self.rate.accepts(&sample.stamp, &sample.omega_rad_s, sample.valid) {
-                self.pursuit.stop();
-                true
-            } else {
-                (self.pursuit.active() || !self.rate.contains(&sample.omega_rad_s)) && self.follows(sample)
-            }
+            && if sample.is_held() { self.accepts_held(sample) } else { self.accepts_new(sample) }
     }
 
     fn refusal(&self, sample: &RateMeasurement) -> Refusal {

@@ -317,7 +317,7 @@ impl Rig for RigidBodyRig {
     }
 
     fn estimate_guard(&self) -> EstimateGuard {
-        self.limits.estimate(&self.leader_coefficients(), self.tick_s, self.rates.observer_ticks)
+        self.limits.estimate(&self.leader_coefficients(), self.tick_s, self.rates.update_ticks())
     }
 
     fn command_guard(&self, _index: usize) -> CommandGuard {

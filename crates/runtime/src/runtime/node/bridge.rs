@@ -8,7 +8,7 @@ use super::missed::MissedTicks;
 use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
-use crate::rig::{Command, Measurement, Rig, Truth};
+use crate::rig::{Command, Measurement, Rig, Sensors, Truth};
 use crate::role::CommandEvent;
 use crate::runtime::device::DeviceLink;
 use crate::runtime::disturb::Interruptions;
@@ -40,6 +40,7 @@ pub struct BridgeNode<R: Rig, B: Bus> {
     acting_ns: Option<u64>,
     missed: MissedTicks,
     reply: Reply<R>,
+    sensors: Sensors,
     lateness: Latency,
     late_ns: u64,
     serial: Latency,
@@ -93,6 +94,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
                 measurement: Measurement::<R>::default(),
                 truth: Truth::<R>::default(),
             },
+            sensors: Sensors::new::<Measurement<R>>(scenario, &body.name),
             lateness: Latency::default(),
             late_ns: scenario.realtime.late_ns(scenario.period_ns),
             serial: Latency::default(),
@@ -141,6 +143,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
     fn publish(&mut self, now_ns: u64) -> Result<Poll, NodeError> {
         let (tick, clock) = (self.counters.next(), self.clock);
         let origin_ns = self.grid.due_ns(tick);
+        self.sensors.hold(tick, self.reply.measurement.words_mut());
         let Reply { event, measurement, truth } = &self.reply;
         let stamp = Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() };
         self.measurement.stage(|sample| {
@@ -375,6 +378,7 @@ impl<R: Rig, B: Bus> Persistent for BridgeNode<R, B> {
     fn state<W: Words>(&mut self, words: &mut W) {
         self.command.persist(words);
         self.acting_ns.persist(words);
+        self.sensors.persist(words);
         self.measurement.persist_late(words);
     }
 }

@@ -242,10 +242,11 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         let mut stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
         self.measurement.stage(|sample| {
             stamp.sent_ns = clock.now_ns();
-            plant.measure(&stamp, sample);
-            if let Some(function) = function {
-                function.write(0, sample.words_mut());
-            }
+            plant.measure_with(&stamp, sample, |sample| {
+                if let Some(function) = function {
+                    function.write(0, sample.words_mut());
+                }
+            });
         })?;
         self.unfinished = Some(tick);
         self.counters.executed();
