@@ -5,6 +5,8 @@
 //! goes on.
 
 #[cfg(feature = "hosts")]
+mod changes;
+#[cfg(feature = "hosts")]
 mod clock;
 mod endpoint;
 #[cfg(feature = "hosts")]

@@ -4,6 +4,7 @@
 //! in lockstep, go through a lossless stream. A late or repeated sample is counted and not passed on; its reader counts it as missing.
 //! No role waits for the relay. Must not interpret a sample.
 
+use super::changes::SharedChanges;
 use super::clock::{ClockError, HostClock};
 use super::endpoint::{HostEndpoint, RELAY};
 use super::forward::Forwarders;
@@ -317,6 +318,9 @@ struct Relay<'a> {
     schedule_in: Option<<IoxBus as Bus>::Reader<Schedule>>,
     schedule_out: Option<<IoxBus as Bus>::Writer<Schedule>>,
     schedule: Schedule,
+    /// The newest announcement that a joined host has received, and the number of changes of inputs that precede it.
+    announced: (u64, Schedule),
+    changes: SharedChanges,
     next_status_ns: u64,
     /// Heartbeats of the roles here, which are sent, and of those elsewhere, which are written.
     health_in: Vec<(u16, <IoxBus as Bus>::Reader<Health>)>,
@@ -395,6 +399,8 @@ impl<'a> Relay<'a> {
             schedule_in: is_hub.then(|| bus.reader(&schedule("run"), Reader::Role)).transpose()?,
             schedule_out: (!is_hub).then(|| bus.writer(&schedule(RELAY), 1)).transpose()?,
             schedule: Schedule::default(),
+            announced: Default::default(),
+            changes: SharedChanges::new(scenario.inputs.received(), plan.hosts.len()),
             next_status_ns: 0,
             health_in,
             health_out,
@@ -479,18 +485,23 @@ impl<'a> Relay<'a> {
             }
             Payload::Acknowledge { next } => self.streams[usize::from(from)].0.acknowledge(next, raw_ns()),
             Payload::Health { role, sample } => self.take_health(from, role, sample)?,
-            Payload::Schedule { sample } => {
-                match (&mut self.schedule_out, bytemuck::try_pod_read_unaligned::<Schedule>(sample)) {
-                    (Some(out), Ok(schedule)) if from_hub => {
-                        // An older announcement may arrive after a newer one.
-                        if schedule.stamp.tick > self.schedule.stamp.tick {
-                            self.schedule = schedule;
-                            out.send(|sample| *sample = schedule)?;
-                        }
+            Payload::Schedule { changes, sample } => match bytemuck::try_pod_read_unaligned::<Schedule>(sample) {
+                Ok(schedule) if from_hub => {
+                    // An older announcement may arrive after a newer one.
+                    if schedule.stamp.tick > self.announced.1.stamp.tick {
+                        self.announced = (changes, schedule);
                     }
-                    _ => self.malformed += 1,
+                    self.adopt_schedule()?;
                 }
+                _ => self.malformed += 1,
+            },
+            Payload::Changes { first, changes: [] } => self.changes.requested(from, first),
+            Payload::Changes { first, changes } if from_hub => {
+                let next = self.changes.take(first, changes);
+                self.send(from, true, Payload::Changes { first: next, changes: &[] });
+                self.adopt_schedule()?;
             }
+            Payload::Changes { .. } => self.malformed += 1,
             pong @ Payload::Pong { .. } => {
                 if let Some(clock) = self.clock.as_mut().filter(|_| from_hub) {
                     self.session_monitor.answered_ns = arrival.at_ns;
@@ -499,6 +510,17 @@ impl<'a> Relay<'a> {
             }
             // Answered in `net`, on arrival.
             Payload::Ping { .. } => {}
+        }
+        Ok(())
+    }
+
+    /// Passes the newest announcement on to the roles of a joined host, once they can see the changes of inputs that precede it.
+    fn adopt_schedule(&mut self) -> Result<(), RelayError> {
+        let (changes, schedule) = self.announced;
+        let is_new = schedule.stamp.tick > self.schedule.stamp.tick && self.changes.count() >= changes;
+        if let Some(out) = self.schedule_out.as_mut().filter(|_| is_new) {
+            self.schedule = schedule;
+            out.send(|sample| *sample = schedule)?;
         }
         Ok(())
     }
@@ -629,6 +651,7 @@ impl<'a> Relay<'a> {
     /// Sends the launcher's announcement, or the heartbeats of roles: on change, and every [`STATUS_NS`].
     fn send_status(&mut self, now_ns: u64) -> Result<(), RelayError> {
         let mut due = now_ns >= self.next_status_ns;
+        let is_hub = self.schedule_in.is_some();
         if let Some(reader) = &mut self.schedule_in {
             while reader.advance()? {}
             let schedule = reader.current().copied().unwrap_or_default();
@@ -637,13 +660,19 @@ impl<'a> Relay<'a> {
             self.schedule = schedule;
             self.shared.running.store(Phase::from_number(schedule.phase) > Phase::Gather, Ordering::Relaxed);
         }
+        // After the schedule: a change is in the list before a role may come to its tick.
+        due |= is_hub && self.changes.grew();
         if !due {
             return Ok(());
         }
         self.next_status_ns = now_ns + STATUS_NS;
-        if self.schedule_in.is_some() {
+        if is_hub {
             for host in self.plan.peers() {
-                self.send(host, true, Payload::Schedule { sample: bytemuck::bytes_of(&self.schedule) });
+                if let Some((first, changes)) = self.changes.wanted_by(host) {
+                    self.send(host, true, Payload::Changes { first, changes: bytemuck::cast_slice(&changes) });
+                }
+                let (changes, sample) = (self.changes.count(), bytemuck::bytes_of(&self.schedule));
+                self.send(host, true, Payload::Schedule { changes, sample });
             }
         }
         for (_, health) in &mut self.health_in {

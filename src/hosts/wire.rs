@@ -23,8 +23,10 @@ pub enum Payload<'a> {
     Acknowledge { next: u64 },
     /// A heartbeat of a role: the role's number, and the bytes of the sample.
     Health { role: u16, sample: &'a [u8] },
-    /// An announcement of the launcher.
-    Schedule { sample: &'a [u8] },
+    /// An announcement of the launcher. It holds once the receiver has this number of changes of inputs.
+    Schedule { changes: u64, sample: &'a [u8] },
+    /// Changes of inputs from this number on, as their words; none in a joined host's request for the next ones.
+    Changes { first: u64, changes: &'a [u8] },
     /// A time request: when it was sent, on the sender's clock.
     Ping { sent_ns: u64 },
     /// The answer to a time request: its `sent_ns`, when it was received and answered on the answering host's clock, and that host's
@@ -84,11 +86,12 @@ impl<'a> Message<'a> {
             Payload::Frame { number, content } => put(1, None, &[number], content),
             Payload::Acknowledge { next } => put(2, None, &[next], &[]),
             Payload::Health { role, sample } => put(3, Some(role), &[], sample),
-            Payload::Schedule { sample } => put(4, None, &[], sample),
+            Payload::Schedule { changes, sample } => put(4, None, &[changes], sample),
             Payload::Ping { sent_ns } => put(5, None, &[sent_ns], &[]),
             Payload::Pong { sent_ns, received_ns, answered_ns, tai_offset_ns } => {
                 put(6, None, &[sent_ns, received_ns, answered_ns, tai_offset_ns], &[]);
             }
+            Payload::Changes { first, changes } => put(7, None, &[first], changes),
         }
         bytes
     }
@@ -105,7 +108,7 @@ impl<'a> Message<'a> {
                 cursor.end(Payload::Acknowledge { next })?
             }
             3 => Payload::Health { role: cursor.short()?, sample: cursor.0 },
-            4 => Payload::Schedule { sample: cursor.0 },
+            4 => Payload::Schedule { changes: cursor.long()?, sample: cursor.0 },
             5 => {
                 let sent_ns = cursor.long()?;
                 cursor.end(Payload::Ping { sent_ns })?
@@ -115,6 +118,7 @@ impl<'a> Message<'a> {
                 let (answered_ns, tai_offset_ns) = (cursor.long()?, cursor.long()?);
                 cursor.end(Payload::Pong { sent_ns, received_ns, answered_ns, tai_offset_ns })?
             }
+            7 => Payload::Changes { first: cursor.long()?, changes: cursor.0 },
             _ => return None,
         };
         Some(Self { from, payload })
@@ -163,7 +167,8 @@ mod tests {
                 Payload::Frame { number: a, content: &rest },
                 Payload::Acknowledge { next: a },
                 Payload::Health { role: short, sample: &rest },
-                Payload::Schedule { sample: &rest },
+                Payload::Schedule { changes: a, sample: &rest },
+                Payload::Changes { first: a, changes: &rest },
                 Payload::Ping { sent_ns: a },
                 Payload::Pong { sent_ns: a, received_ns: b, answered_ns: a, tai_offset_ns: b },
             ];

@@ -75,6 +75,8 @@ const SIGNALLED_END_LIMIT: Duration = Duration::from_millis(300);
 /// Time from the receipt of a change to the first tick at which it may act, ns: longer than a role takes for a tick, and than this
 /// process is usually held up.
 const CHANGE_LEAD_NS: u64 = 3_000_000;
+/// The same for a run over several hosts: the change must cross the network, and is repeated every 20 ms if a message is lost.
+const CHANGE_LEAD_HOSTS_NS: u64 = 300_000_000;
 /// Time without progress after which the run counts as hung, ns and periods.
 const HUNG_NS: u64 = 30_000_000_000;
 const HUNG_PERIODS: u64 = 10;
@@ -178,7 +180,7 @@ fn is_external(scenario: &Scenario, launch: &Launch<'_>, role: &str) -> bool {
     launch.external.iter().chain(&scenario.external).any(|external| external == role)
 }
 
-/// Returns true if changes of inputs do not reach a role: it is on another host, or the program that runs it does not read them.
+/// Returns true if changes of inputs do not reach a role: the program that runs it does not read them.
 fn takes_no_inputs(
     scenario: &Scenario,
     launch: &Launch<'_>,
@@ -187,9 +189,6 @@ fn takes_no_inputs(
     role: RoleId,
 ) -> bool {
     let name = role.name(scenario);
-    if elsewhere(scenario, launch, name).is_some() {
-        return true;
-    }
     let process = || members.iter().find(|member| member.books().any(|(own, _)| own == role))?.pid();
     is_external(scenario, launch, name)
         && listening_process(domain.root(), name).is_none_or(|listener| process().is_some_and(|pid| pid != listener))
@@ -563,10 +562,11 @@ impl<'a> Supervisor<'a> {
             ClockKind::Realtime => {
                 let now_ns = monotonic_ns();
                 let tick_at = |ns: u64| ns.saturating_sub(word.epoch_ns).div_ceil(period_ns);
+                let lead_ns = if launch.host.is_some() { CHANGE_LEAD_HOSTS_NS } else { CHANGE_LEAD_NS };
                 Timing {
-                    earliest: tick_at(now_ns + CHANGE_LEAD_NS),
-                    safe: tick_at(now_ns + CHANGE_LEAD_NS / 3),
-                    horizon: tick_at(now_ns + CHANGE_LEAD_NS + 5 * SCORE_NS),
+                    earliest: tick_at(now_ns + lead_ns),
+                    safe: tick_at(now_ns + lead_ns / 3),
+                    horizon: tick_at(now_ns + lead_ns + 5 * SCORE_NS),
                     clock: Some((word.epoch_ns, period_ns, now_ns)),
                 }
             }
@@ -587,11 +587,7 @@ impl<'a> Supervisor<'a> {
     /// Prints which changes of the scenario a role ignores.
     fn warn_of_ignored_changes(&self, launch: &Launch<'_>) {
         let (scenario, domain, members) = (self.scenario, self.domain, &self.members);
-        // A role of this program on another host reads the changes of the scenario.
-        let ignores = |role: RoleId| {
-            elsewhere(scenario, launch, role.name(scenario)).is_none()
-                && takes_no_inputs(scenario, launch, domain, members, role)
-        };
+        let ignores = |role: RoleId| takes_no_inputs(scenario, launch, domain, members, role);
         for reason in ignored_changes(scenario, &ignores) {
             tell(format_args!("corotate: {reason}; the role ignores its changes in the scenario"));
         }

@@ -172,6 +172,40 @@ fn lockstep_over_two_and_three_hosts_equals_one_thread() {
     }
 }
 
+/// Changes that arrive while the loop runs act at the same tick on every host, also if messages are lost.
+#[test]
+fn live_changes_reach_every_host() {
+    for clock in ["lockstep", "realtime"] {
+        let run = Run::new(&TWO, KEYS, "");
+        let bad = Impairment { delay_us: 200, jitter_us: 300, lost: 50, doubled: 20, late: 20 };
+        let proxy = run.proxy(1, bad);
+        let here = &run.sites[0].bench;
+        let arguments = ["--tick-hz", "50", "--duration", "86400", "--clock", clock, "--record", "--out", "over"];
+        let launched = run.launch("udp", &[&arguments[..], &UNJUDGED].concat());
+        let joined = run.join(1, "udp", Some(proxy.port));
+        run.sites[1].bench.await_commits("controller", 10);
+        let mut ticks = Vec::new();
+        for gain in [3.0, 4.0, 5.0] {
+            // The controller and the observer are on the other host, the follower that is disturbed is here.
+            let changes = [
+                format!("controller.gain_per_s=[{gain:?},{gain:?},{gain:?}]"),
+                format!("observer.decay_rate_per_s={gain:?}"),
+                format!("follower.0.disturbance_rad_s2=[0.0,{:?},0.0]", gain / 1000.0),
+            ];
+            let set = [&["set", "over", "--force", "--json"][..], &changes.each_ref().map(String::as_str)].concat();
+            ticks.push(here.run(&set).succeeded().json()["tick"].as_u64().unwrap());
+            run.sites[1].bench.await_commits("controller", ticks[ticks.len() - 1] + 10);
+        }
+        assert!(ticks.is_sorted());
+        launched.signal(SIGTERM);
+        let done = launched.wait();
+        assert_eq!((done.code, joined.wait().code), (Some(128 + SIGTERM), Some(0)), "{done:?}");
+        let replayed = here.run(&["replay", "over", "--json"]).succeeded();
+        println!("{clock}: changed at {ticks:?}; {}", replayed.stdout);
+        run.assert_clean();
+    }
+}
+
 #[test]
 fn lockstep_over_a_lossy_connection_equals_one_thread() {
     let run = Run::new(&TWO, KEYS, "");
