@@ -13,7 +13,7 @@ use crate::role::{Guard, Observer, command_index, cycle};
 use crate::runtime::{RoleId, ports};
 use crate::sample::{Message, Stamp};
 use crate::score::{Score, Scoring};
-use crate::telemetry::{Checkpoints, Ledger, LinkRead, LinkWritten, RoleReport, StateHash, Ticks};
+use crate::telemetry::{Checkpoints, CommonCheckpoints, LinkRead, LinkWritten, RoleReport, Ticks, chained};
 use std::hint::black_box;
 use std::time::Instant;
 
@@ -24,8 +24,8 @@ pub const TURN_TICKS: u64 = 1024;
 struct Judge<R: Rig> {
     measurement_guard: R::MeasurementGuard,
     command_guard: R::CommandGuard,
-    /// Of the measurements, the truths and the commands.
-    hashes: [StateHash; 3],
+    /// The state hashes of the measurements, the truths and the commands.
+    hashes: [u64; 3],
 }
 
 /// Returns true if a run of this scenario may be a direct one.
@@ -54,7 +54,9 @@ struct Run<'a, R: Rig> {
     observer: Observer<R::Estimator>,
     measurement_guard: R::MeasurementGuard,
     estimate: Estimate<R>,
-    estimate_hash: StateHash,
+    estimate_hash: u64,
+    /// Of the estimates, then of each body as in [`Judge`].
+    checkpoints: CommonCheckpoints,
     /// One guard for controller and scorer: both judge the same samples.
     estimate_guard: R::EstimateGuard,
     scoring: Scoring<R>,
@@ -62,17 +64,13 @@ struct Run<'a, R: Rig> {
 
 impl<'a, R: Rig> Run<'a, R> {
     fn new(rig: &R, scenario: &'a Settings, checkpoints: bool) -> Self {
-        let hash = || match checkpoints {
-            true => StateHash::open(&Ledger::private(StateHash::words(scenario.last_tick)), scenario.last_tick),
-            false => StateHash::without_checkpoints(),
-        };
         let body = |(index, info): (usize, &BodyInfo)| {
             loop_body(rig, index, info.driven, scenario.actuation(info.driven), scenario)
         };
         let judge = |index| Judge {
             measurement_guard: rig.measurement_guard(index, true),
             command_guard: rig.command_guard(index),
-            hashes: [(); 3].map(|()| hash()),
+            hashes: [0; 3],
         };
         Self {
             scenario,
@@ -82,7 +80,8 @@ impl<'a, R: Rig> Run<'a, R> {
             observer: observer(rig, scenario),
             measurement_guard: rig.measurement_guard(0, false),
             estimate: Estimate::<R>::default(),
-            estimate_hash: hash(),
+            estimate_hash: 0,
+            checkpoints: CommonCheckpoints::new(1 + 3 * rig.bodies().len(), checkpoints.then_some(scenario.last_tick)),
             estimate_guard: rig.estimate_guard(),
             scoring: Scoring::new(rig, scenario, false),
         }
@@ -114,16 +113,25 @@ impl<'a, R: Rig> Run<'a, R> {
         {
             return false;
         }
-        self.estimate_hash.absorb(tick, self.estimate.content());
+        let keeps = self.checkpoints.is_due(tick);
+        self.estimate_hash = chained(self.estimate_hash, tick, self.estimate.content());
+        if keeps {
+            self.checkpoints.store(&[self.estimate_hash]);
+        }
         for (body, judge) in self.bodies.iter().zip(&mut self.judges) {
-            judge.hashes[0].absorb(tick, body.measurement.content());
-            judge.hashes[1].absorb(tick, body.truth.content());
-            let Some(control) = &body.control else { continue };
-            let command = &control.commands[command_index(tick, control.commands.len())];
-            if !judge.measurement_guard.accepts(&body.measurement) || !judge.command_guard.accepts(command) {
-                return false;
+            let [measurements, truths, commands] = &mut judge.hashes;
+            *measurements = chained(*measurements, tick, body.measurement.content());
+            *truths = chained(*truths, tick, body.truth.content());
+            if let Some(control) = &body.control {
+                let command = &control.commands[command_index(tick, control.commands.len())];
+                if !judge.measurement_guard.accepts(&body.measurement) || !judge.command_guard.accepts(command) {
+                    return false;
+                }
+                *commands = chained(*commands, tick, command.content());
             }
-            judge.hashes[2].absorb(tick, command.content());
+            if keeps {
+                self.checkpoints.store(&judge.hashes);
+            }
         }
         let bodies = &self.bodies;
         self.scoring.take(|body| Some(&bodies[body].truth), |_| None, Some(&self.estimate), true);
@@ -174,14 +182,13 @@ impl<'a, R: Rig> Run<'a, R> {
 
     fn checkpoints(&self, name: &str, signal: Signal) -> Checkpoints {
         let index = self.scenario.bodies.iter().position(|body| body.name == name).unwrap_or(0);
-        let [measurements, truths, commands] = &self.judges[index].hashes;
-        let hash = match signal {
-            Signal::Measurement => measurements,
-            Signal::Estimate => &self.estimate_hash,
-            Signal::Command => commands,
-            _ => truths,
+        let kind = match signal {
+            Signal::Estimate => return self.checkpoints.of_signal(0, self.estimate_hash),
+            Signal::Measurement => 0,
+            Signal::Command => 2,
+            _ => 1,
         };
-        hash.checkpoints()
+        self.checkpoints.of_signal(1 + 3 * index + kind, self.judges[index].hashes[kind])
     }
 }
 

@@ -55,19 +55,13 @@ impl StateHash {
         Self { value: 0, count: 0, checkpoints, stride, capacity, due: stride }
     }
 
-    /// Creates a hash without checkpoints, for runs that need only the final value.
-    pub fn without_checkpoints() -> Self {
-        let checkpoints = Ledger::private(0).take(0);
-        Self { value: 0, count: 0, checkpoints, stride: 1, capacity: 0, due: u64::MAX }
-    }
-
-    /// Adds the sample content of a tick. Ticks must rise. Inlined, because a length known at compile time halves the cost.
+    /// Adds the sample content of a tick. Ticks must rise.
     #[inline(always)]
     pub fn absorb(&mut self, tick: u64, content: &[u8]) {
         if tick >= self.due {
             self.pass(tick);
         }
-        self.value = xxh3_64_with_seed(content, self.value ^ tick.rotate_left(32));
+        self.value = chained(self.value, tick, content);
         if tick.saturating_add(1) >= self.due {
             self.checkpoint();
         }
@@ -109,6 +103,54 @@ impl Persist for StateHash {
         self.value.persist(words);
         self.count.persist(words);
         self.due = self.count.saturating_add(1).saturating_mul(self.stride);
+    }
+}
+
+/// Returns the hash of a signal after the sample of a tick, from the hash before it. Inlined, because a length known at compile time
+/// halves the cost.
+#[inline(always)]
+pub fn chained(before: u64, tick: u64, content: &[u8]) -> u64 {
+    xxh3_64_with_seed(content, before ^ tick.rotate_left(32))
+}
+
+/// The checkpoints of several signals that all have a sample at every tick.
+#[derive(Debug)]
+pub struct CommonCheckpoints {
+    /// The hashes of all signals at the first checkpoint, then at the second one, …
+    hashes: Vec<u64>,
+    signals: usize,
+    stride: u64,
+    due: u64,
+}
+
+impl CommonCheckpoints {
+    /// Creates the checkpoints of a run whose last tick is `last_tick`; without one, nothing is stored.
+    pub fn new(signals: usize, last_tick: Option<u64>) -> Self {
+        let (stride, capacity) = last_tick.map_or((1, 0), |last| (StateHash::stride(last), StateHash::capacity(last)));
+        let due = last_tick.map_or(u64::MAX, |_| stride);
+        Self { hashes: Vec::with_capacity(signals * capacity as usize), signals, stride, due }
+    }
+
+    /// Returns true if a checkpoint is due after this tick. Its hashes must then be stored. Ticks must rise by one.
+    #[inline(always)]
+    pub fn is_due(&mut self, tick: u64) -> bool {
+        let due = tick + 1 == self.due;
+        if due {
+            self.due += self.stride;
+        }
+        due
+    }
+
+    /// Stores the hashes of the next signals at the checkpoint that is due.
+    #[inline(always)]
+    pub fn store(&mut self, hashes: &[u64]) {
+        self.hashes.extend_from_slice(hashes);
+    }
+
+    /// Returns the checkpoints of a signal, whose hash over all samples is `last`.
+    pub fn of_signal(&self, signal: usize, last: u64) -> Checkpoints {
+        let hashes = self.hashes.iter().skip(signal).step_by(self.signals).copied().collect();
+        Checkpoints { stride: self.stride, hashes, last }
     }
 }
 

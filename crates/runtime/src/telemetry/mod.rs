@@ -20,7 +20,7 @@ mod atomic {
 pub use counters::{ReadCounters, TickCounters, WriteCounters};
 pub use export::{write_hgrm, write_hlog};
 pub(crate) use handover::{find, keep};
-pub use hash::{Checkpoints, StateHash, combine};
+pub use hash::{Checkpoints, CommonCheckpoints, StateHash, chained, combine};
 pub use late::{LateLog, LateRecord, LateTicks, Usage};
 pub use latency::number_or_nan;
 pub use latency::{Latency, MAX_LATENCY_NS, Percentiles, Tallies};
