@@ -1,11 +1,12 @@
-//! `corotate bridge`: connects a device on a serial line to a run, as a role.
+//! `corotate bridge`: connects a device on a serial line or at a UDP address to a run, as a role.
 
 use super::output::{CommandResult, Exit, Failure, fail, say};
 use super::runs::join;
 use crate::launch::line_words;
-use crate::runtime::{DeviceConfig, DeviceError, NodeError};
+use crate::runtime::{DeviceConfig, DeviceError, LineAddress, NodeError};
 use crate::seat::{BridgeResult, RoleError, run_bridge};
 use crate::system::tell;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 /// Options of `corotate bridge`.
@@ -13,11 +14,17 @@ use std::path::PathBuf;
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
     /// Serial line, such as /dev/ttyUSB0; set to raw mode, eight bits, no parity
-    #[arg(long, value_name = "PATH")]
-    serial: PathBuf,
+    #[arg(long, value_name = "PATH", required_unless_present = "udp", conflicts_with = "udp")]
+    serial: Option<PathBuf>,
     /// Speed of the line, bit/s [default: unchanged]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(50..=20_000_000))]
+    #[arg(long, value_name = "N", conflicts_with = "udp", value_parser = clap::value_parser!(u32).range(50..=20_000_000))]
     baud: Option<u32>,
+    /// Address of a device that receives datagrams, such as 127.0.0.1:7700 or [::1]:7700
+    #[arg(long, value_name = "ADDR")]
+    udp: Option<SocketAddr>,
+    /// Accept a UDP address beyond loopback; its frames are not authenticated (insecure)
+    #[arg(long, requires = "udp", hide_short_help = true)]
+    insecure: bool,
     /// Role of the device: a driven body's name, observer, controller, or observer,controller
     #[arg(long, value_name = "NAME", value_delimiter = ',', required = true, alias = "body")]
     role: Vec<String>,
@@ -42,9 +49,10 @@ pub struct Arguments {
 const SCHEMA: &str = "corotate/bridge/v1";
 
 const EXAMPLES: &str = "\
-Example:
+Examples:
   corotate run pair.toml --external follower      prints DIR
-  corotate bridge --serial /dev/ttyACM0 --role follower --domain DIR";
+  corotate bridge --serial /dev/ttyACM0 --role follower --domain DIR
+  corotate bridge --udp 127.0.0.1:7700 --role follower --domain DIR";
 
 fn seconds(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|error| format!("{error}; give a number of seconds"))?;
@@ -52,19 +60,35 @@ fn seconds(text: &str) -> Result<f64, String> {
     sensible.then_some(value).ok_or_else(|| "give 0.001 to 86400 s".to_owned())
 }
 
+/// Returns the place of the device.
+fn address(arguments: &Arguments) -> Result<LineAddress, Failure> {
+    let Some(address) = arguments.udp else {
+        let path = arguments.serial.clone().unwrap_or_default();
+        return Ok(LineAddress::Serial { path, baud: arguments.baud });
+    };
+    if address.ip().is_loopback() || arguments.insecure {
+        return Ok(LineAddress::Udp(address));
+    }
+    let text = format!(
+        "frames to and from {address} are not authenticated; give a loopback address, which a tunnel may end at, or add \
+         --insecure on a trusted network"
+    );
+    Err(Failure::new("open-address", text))
+}
+
 /// Connects the device to the end of the run.
 pub fn bridge(arguments: &Arguments) -> CommandResult {
+    let line = address(arguments).map_err(|failure| fail(Exit::Usage, failure))?;
     let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
     let device = DeviceConfig {
         domain,
         roles: arguments.role.clone(),
-        path: arguments.serial.clone(),
-        baud: arguments.baud,
+        line,
         patience_s: arguments.patience,
         other_device: arguments.allow_other_device,
     };
     let role = device.roles.join(",");
-    let welcomed = |name: &str| tell(format_args!("{role} on {}: {name}", device.path.display()));
+    let welcomed = |name: &str| tell(format_args!("{role} on {}: {name}", device.line));
     let served = run_bridge(&device, &terminated, welcomed).map_err(|error| fail(exit_of(&error), error))?;
     let Some(BridgeResult { counters, outages, lost }) = served else { return Ok(Exit::Ok) };
     if arguments.json {

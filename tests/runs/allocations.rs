@@ -7,7 +7,7 @@ use corotate::bus::{Bus, BusError, Carried, Read, Reader, Signal, Topic, Write};
 use corotate::input::Change;
 use corotate::rig::Rig;
 use corotate::runtime::{
-    DeviceConfig, DeviceLink, Privileges, RoleId, RoleImpl, build_rig, depths, private_ledger, topic,
+    DeviceConfig, DeviceLink, LineAddress, Privileges, RoleId, RoleImpl, build_rig, depths, private_ledger, topic,
 };
 use corotate::sample::{FleetLayout, Health, Phase, RoleState, Sample, Schedule};
 use corotate::scenario::Scenario;
@@ -221,8 +221,7 @@ fn link_device(scenario: &Scenario, roles: &[RoleId], path: &Path) -> RoleImpl {
     let config = DeviceConfig {
         domain: PathBuf::new(),
         roles: names,
-        path: path.to_owned(),
-        baud: None,
+        line: LineAddress::Serial { path: path.to_owned(), baud: None },
         patience_s: 60.0,
         other_device: false,
     };

@@ -21,4 +21,5 @@ mod rates;
 mod serial;
 mod served;
 mod timing;
+mod udp;
 mod verdicts;

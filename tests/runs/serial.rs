@@ -2,7 +2,7 @@
 //! faulty, unplugged and plugged in again.
 
 #[path = "../../examples/serial_device.rs"]
-mod serial_device;
+pub(super) mod serial_device;
 
 use crate::common::{Bench, Done, Running, await_some, shipped};
 use corotate::rig::Rig;
@@ -232,7 +232,7 @@ fn live<S: DeviceRole, M: FnMut(&Hello<'_>) -> Option<S>>(path: &Path, device: &
 }
 
 /// Starts a run with an external follower. Returns it with its domain.
-fn start(bench: &Bench, file: &Path, arguments: &[&str]) -> (Running, PathBuf) {
+pub(super) fn start(bench: &Bench, file: &Path, arguments: &[&str]) -> (Running, PathBuf) {
     start_without(bench, file, &["follower"], arguments)
 }
 

@@ -5,7 +5,7 @@
 
 use super::absence::Absences;
 use super::error::DeviceError;
-use super::line::Line;
+use super::line::{Line, LineAddress};
 use super::node::ports;
 use super::role_id::RoleId;
 use crate::bus::Port;
@@ -14,8 +14,8 @@ use crate::config::{ClockKind, Rates, Settings};
 use crate::role::Rearm;
 use crate::sample::{Stamp, type_name_of};
 use crate::serial::{
-    Answer, DeviceEvent, Hello, HostSession, LineCounters, MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, Reason, Refuse,
-    Samples, Terms, Welcome,
+    Answer, DeviceEvent, Hello, HostSession, LineCounters, MAX_CONTENT, MAX_FRAME, MAX_NAMES, MAX_SAMPLES, Reason,
+    Refuse, Samples, Terms, Welcome,
 };
 use crate::telemetry::Outage;
 use std::path::PathBuf;
@@ -27,8 +27,8 @@ const REOPEN_NS: u64 = 100_000_000;
 const LOOK_NS: u64 = 1_000_000;
 /// Period in which refusals of earlier greetings are ignored, after the greeting dropped the layout hashes, ns.
 const BARE_NS: u64 = 1_000_000_000;
-/// Bytes per read, and reads per turn: garbage must not delay a tick.
-const CHUNK: usize = 512;
+/// Bytes per read, and reads per turn: garbage must not delay a tick, and a datagram is read whole.
+const CHUNK: usize = MAX_FRAME;
 const CHUNKS: usize = 4;
 /// Bits on the line per byte: start, eight data bits, stop.
 const BITS_PER_BYTE: u64 = 10;
@@ -42,10 +42,8 @@ pub struct DeviceConfig {
     pub domain: PathBuf,
     /// Role names: a driven body, `observer` or `controller`; or both of the latter.
     pub roles: Vec<String>,
-    /// The device's serial line.
-    pub path: PathBuf,
-    /// Line speed, bit/s; `None` keeps the current one.
-    pub baud: Option<u32>,
+    /// The place of the device.
+    pub line: LineAddress,
     /// Patience with a silent or absent device, s.
     pub patience_s: f64,
     /// True to accept a device with another name during the run.
@@ -173,7 +171,7 @@ impl DeviceLink {
         let role = roles.iter().map(|role| role.name(scenario)).collect::<Vec<_>>().join(" ");
         layouts.check(&role)?;
         let (inputs, written) = (Layouts::lengths(&layouts.reads), Layouts::lengths(&layouts.writes));
-        check_speed(config.baud, scenario, inputs.iter().chain(&written).sum())?;
+        check_speed(&config.line, scenario, inputs.iter().chain(&written).sum())?;
         let realtime = scenario.clock == ClockKind::Realtime;
         let mut outputs = [0; MAX_SAMPLES];
         outputs.iter_mut().zip(&written).for_each(|(output, length)| *output = *length as u16);
@@ -197,7 +195,7 @@ impl DeviceLink {
             bare_since_ns: None,
         };
         let patience_ns = (config.patience_s * 1e9) as u64;
-        let line = Line::open(&config.path, config.baud)?;
+        let line = Line::to(config.line.clone())?;
         Ok(Self {
             line,
             host: HostSession::new(terms),
@@ -307,7 +305,7 @@ impl DeviceLink {
                     Some(DeviceEvent::Refused(refuse)) if greeting.drop_hashes(&refuse, now_ns) => {}
                     Some(DeviceEvent::Refused(refuse)) => return Err(refused(line, greeting, &refuse)),
                     Some(DeviceEvent::OtherVersion(theirs)) => {
-                        return Err(DeviceError::Version { path: line.path().to_owned(), theirs });
+                        return Err(DeviceError::Version { line: line.address().to_string(), theirs });
                     }
                     Some(DeviceEvent::Answer(received)) => {
                         absences.answered(received.tick);
@@ -319,7 +317,7 @@ impl DeviceLink {
                     }
                 }
             }
-            if count < CHUNK {
+            if count == 0 || line.is_stream() && count < CHUNK {
                 break;
             }
         }
@@ -341,7 +339,7 @@ impl DeviceLink {
     }
 
     fn silent(&mut self, now_ns: u64) -> DeviceError {
-        let counters = self.host.counters();
+        let (counters, refused) = (self.host.counters(), self.line.is_refused());
         let hint = match self.line.reopen() {
             Err(error) => error.to_string(),
             Ok(()) if counters.echoes > 0 => {
@@ -351,10 +349,16 @@ impl DeviceLink {
                 "{} bytes came and no frame was among them: do both ends have the same speed (--baud)?",
                 counters.bytes_received
             ),
+            Ok(()) if refused => {
+                "no program receives at that address: is the device's program running there?".to_owned()
+            }
+            Ok(()) if !self.line.is_stream() => {
+                "is it powered, connected, and running a program of this protocol at that address?".to_owned()
+            }
             Ok(()) => "is it powered, wired (RX to TX), and running a program of this protocol?".to_owned(),
         };
         let waited_s = self.host.silent_ns(now_ns) as f64 / 1e9;
-        DeviceError::Silent { path: self.line.path().to_owned(), waited_s, hint }
+        DeviceError::Silent { line: self.line.address().to_string(), waited_s, hint }
     }
 
     /// Returns the counters of the line.
@@ -382,8 +386,8 @@ fn welcomed(
     let found = printable(welcome.device);
     match device {
         Some(expected) if !other_device => {
-            let path = line.path().to_owned();
-            Err(DeviceError::Other { path, expected: expected.clone(), found })
+            let line = line.address().to_string();
+            Err(DeviceError::Other { line, expected: expected.clone(), found })
         }
         device => Ok(device.replace(found).is_some()),
     }
@@ -413,18 +417,20 @@ fn refused(line: &Line, greeting: &Greeting, refuse: &Refuse<'_>) -> DeviceError
             format!("{detail}; give it the program for this role, or name another one with --role")
         }
     };
-    DeviceError::Refused { path: line.path().to_owned(), role: greeting.role.clone(), reason }
+    DeviceError::Refused { line: line.address().to_string(), role: greeting.role.clone(), reason }
 }
 
 /// Checks that a request and its answer fit into the period.
-fn check_speed(baud: Option<u32>, scenario: &Settings, content: usize) -> Result<(), DeviceError> {
-    let (Some(baud), ClockKind::Realtime) = (baud, scenario.clock) else { return Ok(()) };
+fn check_speed(line: &LineAddress, scenario: &Settings, content: usize) -> Result<(), DeviceError> {
+    let (LineAddress::Serial { baud: Some(baud), .. }, ClockKind::Realtime) = (line, scenario.clock) else {
+        return Ok(());
+    };
     let bits = BITS_PER_BYTE * (2 * FRAME_OVERHEAD + content as u64);
     let tick_us = (scenario.period_ns as f64 * scenario.realtime.cutoff / 1e3) as u64;
-    let line_us = bits * 1_000_000 / u64::from(baud.max(1));
+    let line_us = bits * 1_000_000 / u64::from((*baud).max(1));
     if line_us > tick_us {
         let least = (bits * 1_000_000).div_ceil(tick_us.max(1));
-        return Err(DeviceError::TooSlow { baud, line_us, tick_us, least });
+        return Err(DeviceError::TooSlow { baud: *baud, line_us, tick_us, least });
     }
     Ok(())
 }

@@ -3,13 +3,12 @@
 use super::line::LineError;
 use crate::bus::BusError;
 use crate::serial::{MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, VERSION};
-use std::path::PathBuf;
 
 /// A device failed or cannot take part.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum DeviceError {
-    /// The serial line could not be opened.
+    /// The line could not be opened.
     #[error(transparent)]
     #[strum(transparent)]
     Line(#[from] LineError),
@@ -52,11 +51,11 @@ pub enum DeviceError {
         observer_ticks: u64,
     },
     /// The device does not answer.
-    #[error("the device on {} has not answered for {waited_s:.1} s: {hint}", path.display())]
+    #[error("the device on {line} has not answered for {waited_s:.1} s: {hint}")]
     #[strum(serialize = "device-silent")]
     Silent {
         /// The line.
-        path: PathBuf,
+        line: String,
         /// Waiting time, s.
         waited_s: f64,
         /// A hint on what to check.
@@ -64,26 +63,24 @@ pub enum DeviceError {
     },
     /// The device uses another protocol version.
     #[error(
-        "the device on {} speaks protocol version {theirs} and this program version {VERSION}; update the older of the two",
-        path.display()
+        "the device on {line} speaks protocol version {theirs} and this program version {VERSION}; update the older of the two"
     )]
     #[strum(serialize = "device-version")]
     Version {
         /// The line.
-        path: PathBuf,
+        line: String,
         /// The device's version.
         theirs: u8,
     },
     /// Another device answers instead of the expected one.
     #[error(
-        "on {} the device `{found}` answers in the place of `{expected}`; connect that one again, or give \
-         --allow-other-device",
-        path.display()
+        "on {line} the device `{found}` answers in the place of `{expected}`; connect that one again, or give \
+         --allow-other-device"
     )]
     #[strum(serialize = "other-device")]
     Other {
         /// The line.
-        path: PathBuf,
+        line: String,
         /// The name of the device at the start of the run.
         expected: String,
         /// The name of the device that answered.
@@ -106,11 +103,11 @@ pub enum DeviceError {
         samples: usize,
     },
     /// The device refuses the role.
-    #[error("the device on {} refuses to be `{role}`: {reason}", path.display())]
+    #[error("the device on {line} refuses to be `{role}`: {reason}")]
     #[strum(serialize = "device-refused")]
     Refused {
         /// The line.
-        path: PathBuf,
+        line: String,
         /// The role.
         role: String,
         /// The device's reason, with a remedy.

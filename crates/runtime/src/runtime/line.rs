@@ -1,4 +1,5 @@
-//! A serial line: a terminal device in raw mode that is read and written without waiting, and reopened after a cut.
+//! The line to a device: a terminal device in raw mode that is reopened after a cut, or a UDP address with one frame per
+//! datagram. Both are read and written without waiting.
 //!
 //! Must not know the meaning of its bytes, nor decide how long to wait for a line that is gone.
 
@@ -10,7 +11,9 @@ use rustix::termios::{
     ControlModes, OptionalActions, QueueSelector, SpecialCodeIndex, isatty, tcflush, tcgetattr, tcsetattr,
 };
 use std::ffi::CString;
+use std::fmt;
 use std::io;
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
@@ -53,15 +56,48 @@ pub enum LineError {
         /// The system's reason.
         source: io::Error,
     },
+    /// No socket can reach the address.
+    #[error("cannot send to {address}: {source}; give the address of a device that this machine has a route to")]
+    #[strum(serialize = "no-route")]
+    Socket {
+        /// The device's address.
+        address: SocketAddr,
+        /// The system's reason.
+        source: io::Error,
+    },
 }
 
-/// A serial line, open or cut.
+/// The place of a device.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum LineAddress {
+    /// A terminal device.
+    Serial {
+        /// Its path.
+        path: PathBuf,
+        /// The speed, bit/s; `None` keeps the current one.
+        baud: Option<u32>,
+    },
+    /// An address that receives datagrams.
+    Udp(SocketAddr),
+}
+
+impl fmt::Display for LineAddress {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Serial { path, .. } => path.display().fmt(f),
+            Self::Udp(address) => write!(f, "udp/{address}"),
+        }
+    }
+}
+
+/// A line to a device, open or cut. A UDP address is never cut.
 pub struct Line {
-    path: PathBuf,
-    /// `path` as a C string, so that reopening does not allocate.
+    address: LineAddress,
+    /// The path of a terminal device as a C string, so that reopening does not allocate.
     name: CString,
-    baud: Option<u32>,
     port: Option<OwnedFd>,
+    /// True while the machine of a UDP address answers that no program receives there.
+    refused: bool,
     outgoing: [u8; MAX_FRAME],
     from: usize,
     to: usize,
@@ -73,24 +109,43 @@ impl Line {
     /// # Errors
     /// [`LineError`].
     pub fn open(path: &Path, baud: Option<u32>) -> Result<Self, LineError> {
-        let name = CString::new(path.as_os_str().as_bytes()).map_err(|_| refused(path, Errno::INVAL))?;
-        let port = open_port(path, &name, baud)?;
-        Ok(Self { path: path.to_owned(), name, baud, port: Some(port), outgoing: [0; MAX_FRAME], from: 0, to: 0 })
+        Self::to(LineAddress::Serial { path: path.to_owned(), baud })
     }
 
-    /// The device.
-    pub fn path(&self) -> &Path {
-        &self.path
+    /// Opens the line to an address.
+    ///
+    /// # Errors
+    /// [`LineError`].
+    pub fn to(address: LineAddress) -> Result<Self, LineError> {
+        let name = match &address {
+            LineAddress::Serial { path, .. } => {
+                CString::new(path.as_os_str().as_bytes()).map_err(|_| refused(path, Errno::INVAL))?
+            }
+            LineAddress::Udp(_) => CString::default(),
+        };
+        let port = Some(open_port(&address, &name)?);
+        Ok(Self { address, name, port, refused: false, outgoing: [0; MAX_FRAME], from: 0, to: 0 })
     }
 
-    /// The requested speed, bit/s.
-    pub fn baud(&self) -> Option<u32> {
-        self.baud
+    /// The place of the device.
+    pub fn address(&self) -> &LineAddress {
+        &self.address
     }
 
     /// Returns true unless the line is known to be cut.
     pub fn is_open(&self) -> bool {
         self.port.is_some()
+    }
+
+    /// Returns true if bytes arrive as a stream, so that a read of fewer than asked for has emptied it. Otherwise each
+    /// read returns one datagram.
+    pub fn is_stream(&self) -> bool {
+        matches!(self.address, LineAddress::Serial { .. })
+    }
+
+    /// Returns true if the machine at a UDP address has answered the last datagram that no program receives there.
+    pub fn is_refused(&self) -> bool {
+        self.refused
     }
 
     /// Tries to open the line again.
@@ -100,16 +155,24 @@ impl Line {
     pub fn reopen(&mut self) -> Result<(), LineError> {
         // The old descriptor is closed first: the device may allow one only.
         self.cut();
-        self.port = Some(open_port(&self.path, &self.name, self.baud)?);
+        self.port = Some(open_port(&self.address, &self.name)?);
         Ok(())
     }
 
-    /// Reads available bytes and returns their number. Closes a line that is found to be cut.
+    /// Reads available bytes and returns their number. Closes a serial line that is found to be cut.
     pub fn read(&mut self, bytes: &mut [u8]) -> usize {
         let Some(port) = &self.port else { return 0 };
         match rustix::io::read(port, bytes) {
-            Ok(count) if count > 0 => count,
+            Ok(count) if count > 0 => {
+                self.refused = false;
+                count
+            }
             Err(Errno::AGAIN | Errno::INTR) => 0,
+            // An empty datagram, or the network's answer to an earlier one.
+            result if !self.is_stream() => {
+                self.refused |= result == Err(Errno::CONNREFUSED);
+                0
+            }
             // End of the stream, or the error of an unplugged device.
             Ok(_) | Err(_) => {
                 self.cut();
@@ -131,12 +194,17 @@ impl Line {
 
     /// Sends as much of the last frame as the line takes.
     pub fn flush(&mut self) {
+        let mut answered = false;
         while self.from < self.to {
             let Some(port) = &self.port else { return };
             match rustix::io::write(port, &self.outgoing[self.from..self.to]) {
                 Ok(count) => self.from += count,
                 Err(Errno::INTR) => {}
                 Err(Errno::AGAIN) => return,
+                // The answer to an earlier datagram, once; this one is not sent yet.
+                Err(Errno::CONNREFUSED) if !answered => (answered, self.refused) = (true, true),
+                // The network has lost the datagram.
+                Err(_) if !self.is_stream() => self.from = self.to,
                 Err(_) => self.cut(),
             }
         }
@@ -157,7 +225,28 @@ fn refused(path: &Path, error: Errno) -> LineError {
     LineError::Open { path: path.to_owned(), source: error.into(), remedy }
 }
 
-fn open_port(path: &Path, name: &CString, baud: Option<u32>) -> Result<OwnedFd, LineError> {
+fn open_port(address: &LineAddress, name: &CString) -> Result<OwnedFd, LineError> {
+    match address {
+        LineAddress::Serial { path, baud } => open_terminal(path, name, *baud),
+        LineAddress::Udp(address) => {
+            open_socket(*address).map_err(|source| LineError::Socket { address: *address, source })
+        }
+    }
+}
+
+/// Opens a socket that receives datagrams from this address only.
+fn open_socket(address: SocketAddr) -> io::Result<OwnedFd> {
+    let own: SocketAddr = match address {
+        SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
+        SocketAddr::V6(_) => (Ipv6Addr::UNSPECIFIED, 0).into(),
+    };
+    let socket = UdpSocket::bind(own)?;
+    socket.connect(address)?;
+    socket.set_nonblocking(true)?;
+    Ok(socket.into())
+}
+
+fn open_terminal(path: &Path, name: &CString, baud: Option<u32>) -> Result<OwnedFd, LineError> {
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
     let port = match open(name.as_c_str(), flags, Mode::empty()) {
         Ok(port) if isatty(&port) => port,
@@ -249,6 +338,47 @@ mod tests {
         std::os::unix::fs::symlink(&path, &link).unwrap();
         line.reopen().unwrap();
         assert!(line.is_open());
+    }
+
+    /// A datagram is a frame. A refusal by the other machine is not a cut, and hides no datagram.
+    #[test]
+    fn datagrams_pass_whole_over_both_versions_of_the_protocol() {
+        for own in ["127.0.0.1:0", "[::1]:0"] {
+            let far = UdpSocket::bind(own).unwrap();
+            let address = far.local_addr().unwrap();
+            let mut line = Line::to(LineAddress::Udp(address)).unwrap();
+            let (frame, mut bytes) = ([7; MAX_FRAME], [0; MAX_FRAME]);
+            // A loaded system delivers datagrams, and refusals, later.
+            let end = std::time::Instant::now() + std::time::Duration::from_secs(20);
+            let read = |line: &mut Line, bytes: &mut [u8]| loop {
+                let count = line.read(bytes);
+                assert!(std::time::Instant::now() < end, "no datagram came");
+                if count > 0 {
+                    return count;
+                }
+            };
+            assert!(line.write(&frame) && line.read(&mut bytes) == 0 && !line.is_stream());
+            let (count, host) = far.recv_from(&mut bytes).unwrap();
+            assert_eq!((count, bytes), (MAX_FRAME, frame));
+            for length in [3, 0, 5] {
+                far.send_to(&frame[..length], host).unwrap();
+            }
+            assert_eq!([read(&mut line, &mut bytes), read(&mut line, &mut bytes)], [3, 5]);
+            // Not from another address.
+            UdpSocket::bind(own).unwrap().send_to(&frame, host).unwrap();
+            far.send_to(&frame[..4], host).unwrap();
+            assert_eq!(read(&mut line, &mut bytes), 4);
+            drop(far);
+            while !line.is_refused() {
+                assert!(line.write(&frame) && std::time::Instant::now() < end);
+            }
+            assert!(line.is_open());
+            let far = UdpSocket::bind(address).unwrap();
+            assert!(line.write(&frame));
+            assert_eq!(far.recv(&mut bytes).unwrap(), MAX_FRAME);
+            far.send_to(&frame, host).unwrap();
+            assert!(read(&mut line, &mut bytes) == MAX_FRAME && !line.is_refused());
+        }
     }
 
     #[test]

@@ -31,7 +31,7 @@ pub use drive::{Backoff, Driver, Ended, LauncherLink, drive_in_turn, drive_in_tu
 pub use error::{DeviceError, NodeError};
 pub use ignored::{ignored_changes, ignoring_role};
 pub use late_watch::LateWatch;
-pub use line::{Line, LineError};
+pub use line::{Line, LineAddress, LineError};
 #[cfg(feature = "hosts")]
 pub use link::RetainedSamples;
 pub use link::{AcceptedTicks, Input, Output, Seek};
