@@ -127,6 +127,7 @@ mod tests {
             grants: vec![grant(false)],
             line: None,
             outages: Vec::new(),
+            pace: None,
             late_inputs: 0,
             late_ticks: Vec::new(),
         }

@@ -4,14 +4,10 @@
 //! One exchange gives the offset to half its round trip and no better, because all of it may be spent in one direction. So the fastest
 //! exchange of each window is kept, and a line through these gives offset and drift. Must not read a clock.
 
-use std::collections::VecDeque;
+use crate::clock::{MinimumFilter, Observation};
 
 /// Length of a window, of which the fastest exchange is kept, ns.
 const WINDOW_NS: u64 = 500_000_000;
-/// Number of windows: enough to measure the drift, few enough for a drift that changes with temperature.
-const WINDOWS: usize = 24;
-/// Shortest span over which a drift is distinguished from jitter, ns.
-const DRIFT_SPAN_NS: f64 = 1e9;
 /// Largest drift between two computer clocks, ns per ns: each quartz is within 100 ppm.
 const DRIFT_MAX: f64 = 200e-6;
 /// Number of exchanges before the first estimate.
@@ -64,22 +60,9 @@ pub struct Estimate {
     pub round_trip_ns: u64,
 }
 
-/// The fastest exchange of a window.
-#[derive(Debug, Clone, Copy)]
-struct Fastest {
-    window: u64,
-    /// Middle of the exchange on the local clock, since the first exchange, ns.
-    at_ns: f64,
-    /// Offset less that of the first exchange, ns.
-    offset_ns: f64,
-    round_trip_ns: f64,
-}
-
-impl Fastest {
-    /// Returns the bound on the error of the offset, ns: half the round trip, and the largest drift during it.
-    fn error_ns(&self) -> f64 {
-        self.round_trip_ns * (0.5 + DRIFT_MAX)
-    }
+/// Returns the bound on the error of the offset of an exchange, ns: half the round trip, and the largest drift during it.
+fn error_ns(exchange: &Observation) -> f64 {
+    exchange.delay_ns * (0.5 + DRIFT_MAX)
 }
 
 /// An estimator of the offset and drift of one remote clock.
@@ -87,7 +70,8 @@ impl Fastest {
 pub struct OffsetEstimator {
     /// Time and offset of the first exchange; those in `fastest` are relative to it.
     origin: Option<(u64, i64)>,
-    fastest: VecDeque<Fastest>,
+    /// The fastest exchange of each window: at its middle on the local clock, delayed by its round trip.
+    fastest: MinimumFilter,
     taken: usize,
 }
 
@@ -97,74 +81,45 @@ impl OffsetEstimator {
         let Some(round_trip_ns) = exchange.round_trip_ns() else { return };
         let (origin_ns, origin_offset_ns) = *self.origin.get_or_insert((exchange.sent_ns, exchange.offset_ns()));
         let since_ns = |time_ns: u64| time_ns.wrapping_sub(origin_ns) as i64 as f64;
-        let found = Fastest {
+        self.taken += 1;
+        self.fastest.take(Observation {
             window: exchange.returned_ns / WINDOW_NS,
             at_ns: (since_ns(exchange.sent_ns) + since_ns(exchange.returned_ns)) / 2.0,
             offset_ns: exchange.offset_ns().wrapping_sub(origin_offset_ns) as f64,
-            round_trip_ns: round_trip_ns as f64,
-        };
-        self.taken += 1;
-        match self.fastest.back_mut().filter(|last| last.window == found.window) {
-            Some(last) if last.round_trip_ns <= found.round_trip_ns => {}
-            Some(last) => *last = found,
-            None => self.fastest.push_back(found),
-        }
-        if self.fastest.len() > WINDOWS {
-            self.fastest.pop_front();
-        }
+            delay_ns: round_trip_ns as f64,
+        });
     }
 
     /// Returns the estimate at a time on the local clock; `None` before enough exchanges.
     pub fn at(&self, now_ns: u64) -> Option<Estimate> {
         let (origin_ns, origin_offset_ns) = self.origin.filter(|_| self.taken >= ENOUGH)?;
         let now = now_ns.wrapping_sub(origin_ns) as i64 as f64;
-        let least_ns = self.fastest.iter().map(|point| point.round_trip_ns).fold(f64::INFINITY, f64::min);
-        let (offset, drift) = self.line(least_ns);
-        let drift_error = self.drift_error(drift);
+        let kept = self.fastest.kept();
+        let least_ns = kept.iter().map(|exchange| exchange.delay_ns).fold(f64::INFINITY, f64::min);
+        let line = self.fastest.line(DRIFT_MAX, |exchange| {
+            let excess = (exchange.delay_ns - least_ns) / (SIMILAR * least_ns + 1.0);
+            1.0 / (1.0 + excess * excess)
+        });
+        let drift_error = self.drift_error(line.drift);
         // Each kept exchange bounds the offset at its own time, and with the drift the offset at `now_ns`.
-        let bound = |point: &Fastest| {
-            let residual = (offset + drift * point.at_ns - point.offset_ns).abs();
-            point.error_ns() + residual + drift_error * (now - point.at_ns).abs()
+        let bound = |exchange: &Observation| {
+            let residual = (line.at(exchange.at_ns) - exchange.offset_ns).abs();
+            error_ns(exchange) + residual + drift_error * (now - exchange.at_ns).abs()
         };
-        let error_ns = self.fastest.iter().map(bound).fold(f64::INFINITY, f64::min);
-        let offset_ns = origin_offset_ns.wrapping_add((offset + drift * now).round() as i64);
-        Some(Estimate { offset_ns, drift, error_ns, round_trip_ns: least_ns as u64 })
+        let error_ns = kept.iter().map(bound).fold(f64::INFINITY, f64::min);
+        let offset_ns = origin_offset_ns.wrapping_add(line.at(now).round() as i64);
+        Some(Estimate { offset_ns, drift: line.drift, error_ns, round_trip_ns: least_ns as u64 })
     }
 
     /// Returns a bound on the error of a drift: any two exchanges give one.
     fn drift_error(&self, drift: f64) -> f64 {
-        let pairs = self.fastest.iter().enumerate().flat_map(|(n, a)| self.fastest.range(..n).map(move |b| (a, b)));
-        let bound = |(a, b): (&Fastest, &Fastest)| {
+        let kept = self.fastest.kept();
+        let pairs = kept.iter().enumerate().flat_map(|(n, a)| kept.range(..n).map(move |b| (a, b)));
+        let bound = |(a, b): (&Observation, &Observation)| {
             let apart_ns = a.at_ns - b.at_ns;
-            (drift - (a.offset_ns - b.offset_ns) / apart_ns).abs() + (a.error_ns() + b.error_ns()) / apart_ns
+            (drift - (a.offset_ns - b.offset_ns) / apart_ns).abs() + (error_ns(a) + error_ns(b)) / apart_ns
         };
         pairs.filter(|(a, b)| a.at_ns > b.at_ns).map(bound).fold(drift.abs() + DRIFT_MAX, f64::min)
-    }
-
-    /// Returns offset at the origin and drift of the least-squares line; slower exchanges have lower weight.
-    fn line(&self, least_ns: f64) -> (f64, f64) {
-        let weight = |point: &Fastest| {
-            let excess = (point.round_trip_ns - least_ns) / (SIMILAR * least_ns + 1.0);
-            1.0 / (1.0 + excess * excess)
-        };
-        let sum = |value: &dyn Fn(&Fastest) -> f64| {
-            self.fastest.iter().map(|point| weight(point) * value(point)).sum::<f64>()
-        };
-        let total = sum(&|_| 1.0);
-        let (time, offset) = (sum(&|point| point.at_ns) / total, sum(&|point| point.offset_ns) / total);
-        let variance = sum(&|point| (point.at_ns - time).powi(2));
-        let covariance = sum(&|point| (point.at_ns - time) * (point.offset_ns - offset));
-        let span_ns = match (self.fastest.front(), self.fastest.back()) {
-            (Some(first), Some(last)) => last.at_ns - first.at_ns,
-            _ => 0.0,
-        };
-        if span_ns < DRIFT_SPAN_NS {
-            // Among equally fast exchanges the newest has drifted least.
-            let is_fast = |point: &&Fastest| point.round_trip_ns <= (1.0 + SIMILAR) * least_ns;
-            return (self.fastest.iter().rev().find(is_fast).map_or(offset, |point| point.offset_ns), 0.0);
-        }
-        let drift = (covariance / variance).clamp(-DRIFT_MAX, DRIFT_MAX);
-        (offset - drift * time, drift)
     }
 }
 

@@ -3,7 +3,7 @@
 //! Decodes the time around a late tick only. Must not wait for the kernel.
 
 use super::TracerCost;
-use crate::clock::monotonic_ns;
+use crate::clock::{correction_ns, raw_ns};
 use crate::runtime::usable_cores;
 use corotate_trace::{Event, Instance, Page, TraceError, Window, remove_instances};
 use rustix::time::{ClockId, clock_gettime};
@@ -55,7 +55,7 @@ impl TraceRing {
 
     /// Reads the pages that the kernel holds, and drops old ones.
     pub fn read(&mut self) {
-        let now_ns = monotonic_ns();
+        let now_ns = raw_ns();
         for (core, pages) in &mut self.cores {
             let overruns = &mut self.overruns;
             self.instance.read(*core, &mut |page| {
@@ -77,8 +77,10 @@ impl TraceRing {
         Window::new(self.decode(from_ns, to_ns), from_ns, to_ns)
     }
 
-    /// Decodes the events of a time on all cores.
+    /// Decodes the events of a time on all cores. The kernel's time is this host's own, all others are the run's.
     fn decode(&mut self, from_ns: u64, to_ns: u64) -> Vec<Event> {
+        let correction_ns = correction_ns();
+        let [from_ns, to_ns] = [from_ns, to_ns].map(|ns| ns.saturating_add_signed(-correction_ns));
         let mut events = Vec::new();
         for (core, pages) in &self.cores {
             let first = pages.partition_point(|page| page.start_ns <= from_ns).saturating_sub(1);
@@ -86,6 +88,7 @@ impl TraceRing {
                 self.instance.formats().decode(page, *core, &mut events);
             }
         }
+        events.iter_mut().for_each(|event| event.ns = event.ns.saturating_add_signed(correction_ns));
         self.events += events.len() as u64;
         events
     }

@@ -8,7 +8,7 @@ use crate::config::{ClockKind, TickAmount, TickLimit};
 use crate::fault::{Action as FaultAction, Interruption};
 use crate::scenario::Scenario;
 use crate::score::StepResponse;
-use crate::telemetry::{Percentiles, Ticks};
+use crate::telemetry::{PaceReport, Percentiles, Ticks};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
 
@@ -42,6 +42,13 @@ const LATENCIES: [LatencyCriterion; 6] = [
     ("lateness_p99_us_max", "lateness", |figures| figures.p99_us),
     ("lateness_max_us", "lateness", |figures| figures.max_us),
 ];
+
+/// A criterion on the pace of a device: key, and figure if it was measured.
+type PaceCriterion = (&'static str, fn(&PaceReport) -> Option<f64>);
+
+/// The criteria on the pace of a device.
+const PACES: [PaceCriterion; 2] =
+    [("phase_error_p99_us_max", |pace| pace.phase_error_p99_us), ("slips_max", |pace| Some(pace.slips as f64))];
 
 /// A criterion and its verdict.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -95,6 +102,8 @@ pub enum Unjudged {
     Unbooked,
     /// No input made such a step.
     NoStep,
+    /// No device set the pace.
+    NoPace,
     /// A reason read back from a summary.
     Recorded(String),
 }
@@ -110,6 +119,7 @@ impl fmt::Display for Unjudged {
             }
             Self::Unbooked => f.write_str("the role keeps no counters"),
             Self::NoStep => f.write_str("no input made such a step"),
+            Self::NoPace => f.write_str("no device set the pace"),
             Self::Recorded(reason) => f.write_str(reason),
         }
     }
@@ -187,6 +197,7 @@ impl Judge<'_> {
             criteria.push(Criterion::new("unscored_ticks_max", limit, Some(unscored as f64)));
         }
         criteria.extend(accept.latency_max_us.iter().map(|(key, limit)| self.latency(key, *limit)));
+        criteria.extend(accept.pace_max.iter().map(|(key, limit)| self.pace(key, *limit)));
         criteria.extend(accept.response_max.iter().map(|(key, limit)| self.response(key, *limit)));
         criteria
     }
@@ -203,6 +214,18 @@ impl Judge<'_> {
         let reason = (self.scenario.clock != ClockKind::Realtime).then_some(Unjudged::Clock);
         let criterion = Criterion::new(key, limit, worst.map(|(_, us)| us)).unless(reason);
         Criterion { role: worst.map(|(role, _)| role.clone()), ..criterion }
+    }
+
+    /// Judges the device that sets the pace.
+    fn pace(&self, key: &str, limit: f64) -> Criterion {
+        let (_, figure) = PACES[PACES.iter().position(|(name, _)| *name == key).unwrap_or(0)];
+        let paced = self.outcome.reports.iter().find_map(|report| Some((&report.role, report.pace.as_ref()?)));
+        let reason = match self.scenario.clock {
+            ClockKind::Realtime => paced.is_none().then_some(Unjudged::NoPace),
+            _ => Some(Unjudged::Clock),
+        };
+        let criterion = Criterion::new(key, limit, paced.and_then(|(_, pace)| figure(pace))).unless(reason);
+        Criterion { role: paced.map(|(role, _)| role.clone()), ..criterion }
     }
 
     /// Judges the response with the largest figure. One without the figure, such as one that does not settle, does not hold.

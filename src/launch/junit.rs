@@ -5,6 +5,7 @@
 use super::{Action, Criterion, Summary, exact};
 use crate::config::RunId;
 use crate::late::{CauseTotal, LateReport};
+use crate::telemetry::PaceReport;
 use quick_xml::Writer;
 use std::io;
 
@@ -86,6 +87,7 @@ fn properties(xml: &mut Xml, run: RunId, summary: Option<&Summary>) -> io::Resul
             (format!("rejected_samples of {} at {}", link.service, link.reader), link.rejected.to_string())
         }));
         properties.extend(summary.late.iter().flat_map(late_ticks));
+        properties.extend(summary.pace.iter().flat_map(|(role, pace)| paces(role, pace)));
     }
     xml.create_element("properties").write_inner_content(|xml| {
         properties.iter().try_for_each(|(name, value)| {
@@ -104,6 +106,20 @@ fn late_ticks(late: &LateReport) -> Vec<(String, String)> {
     let totals = totals.map(|(name, value)| (name.to_owned(), value));
     let cause = |total: &CauseTotal| (format!("late_ticks by {}", total.cause), total.ticks.to_string());
     totals.into_iter().chain(late.causes.iter().take(CAUSES).map(cause)).collect()
+}
+
+/// Returns the relation of the run's clock to the device that sets its pace.
+fn paces(role: &str, pace: &PaceReport) -> Vec<(String, String)> {
+    let us = |value: Option<f64>| value.map_or("not measured".to_owned(), |us| us.to_string());
+    let values = [
+        ("state", pace.state.clone()),
+        ("phase_error_p50_us", us(pace.phase_error_p50_us)),
+        ("phase_error_p99_us", us(pace.phase_error_p99_us)),
+        ("phase_error_max_us", us(pace.phase_error_max_us)),
+        ("drift_ppm", pace.drift_ppm.to_string()),
+        ("slips", pace.slips.to_string()),
+    ];
+    values.into_iter().map(|(name, value)| (format!("pace {name} of {role}"), value)).collect()
 }
 
 /// Returns the cases: the run, its counters, and the criteria in their order.

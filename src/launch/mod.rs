@@ -53,7 +53,7 @@ pub use session::{ScenarioKind, StepSession};
 pub use steps::{BodyState, Steps};
 pub(crate) use summary::Judged;
 pub use summary::{Summary, write_run};
-pub use table::{line_words, table};
+pub use table::{line_words, pace_words, table};
 pub(crate) use table::{plain, reasons};
 
 use crate::config::ClockKind;

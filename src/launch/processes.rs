@@ -23,7 +23,7 @@ use crate::bus::domain::{Domain, OwnedDomain, require_files};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Signal, Write};
 use crate::changes::ReceivedChanges;
-use crate::clock::{Grid, monotonic_ns};
+use crate::clock::{self, Grid, RunClock, monotonic_ns};
 use crate::config::ClockKind;
 use crate::hosts::{NetworkStatistics, RELAY};
 use crate::input::Change;
@@ -31,8 +31,8 @@ use crate::inputs::{InputServer, Timing};
 use crate::late::TRACER;
 use crate::record::RECORDER;
 use crate::runtime::{
-    Backoff, RoleId, depths, hold_low_latency_idle, ignored_changes, report, request_short_slices, shared_memory_bytes,
-    topic, window_ticks,
+    Backoff, PaceBoard, RoleId, depths, hold_low_latency_idle, ignored_changes, report, request_short_slices,
+    shared_memory_bytes, topic, window_ticks,
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
 use crate::scenario::Scenario;
@@ -89,6 +89,8 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let domain = owned.domain();
     scenario.inputs.receive_in(ReceivedChanges::default());
     prepare(scenario, launch, domain)?;
+    let pace = open_pace(scenario, launch, domain)?;
+    let _own_clock = pace.as_ref().map(|_| OwnClockAfter);
     let startup_limit = Duration::from_secs_f64(scenario.startup_timeout_s);
     let mut janitor = Janitor::start(domain, startup_limit)?;
     let (_low_latency, grants) = match scenario.clock {
@@ -97,6 +99,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     };
     let bus = IoxBus::enter(domain, "launcher", depths(scenario))?.with_opening_limit(startup_limit);
     let mut supervisor = Supervisor::start(scenario, launch, domain, &bus, &mut janitor)?;
+    supervisor.pace = pace;
     let mut scorer = open_scorer(scenario, &bus).map_err(|error| supervisor.blame(error.into()))?;
     let signal = supervisor.run_phases(&mut *scorer, launch, &grants).map_err(|error| supervisor.blame(error))?;
     let mut shutdown = supervisor.shut_down(if signal == 0 { END_LIMIT } else { SIGNALLED_END_LIMIT });
@@ -143,6 +146,28 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
         signal,
         remains,
     })
+}
+
+/// Makes the clock that a device may set, in a run in real time with an external body, and uses it in this process.
+fn open_pace(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain) -> Result<Option<PaceBoard>, LaunchError> {
+    let mut bodies = scenario.bodies.iter().filter(|body| body.driven && body.fleet.is_none());
+    if scenario.clock != ClockKind::Realtime || !bodies.any(|body| is_external(scenario, launch, &body.name)) {
+        return Ok(None);
+    }
+    let path = domain.shared(RunClock::PACE);
+    let failed = |source| LaunchError::Write { path: path.clone(), source };
+    let board = PaceBoard::open(domain).map_err(failed)?;
+    clock::adopt(&path).map_err(failed)?;
+    Ok(Some(board))
+}
+
+/// Makes this process use its own clock again when it is dropped.
+struct OwnClockAfter;
+
+impl Drop for OwnClockAfter {
+    fn drop(&mut self) {
+        clock::release();
+    }
 }
 
 /// Creates a domain with the shared memory that a run of a scenario needs.
@@ -276,6 +301,8 @@ pub(super) struct Supervisor<'a> {
     foxglove: Companion,
     relay: RelayWatch,
     tracer: TracerWatch,
+    /// Present if a device may set the pace.
+    pace: Option<PaceBoard>,
     /// Absent on a host that joined: the launching host receives the changes.
     inputs: Option<InputServer>,
     received: Arc<ReceivedChanges>,
@@ -333,6 +360,7 @@ impl<'a> Supervisor<'a> {
             foxglove,
             relay,
             tracer,
+            pace: None,
             inputs,
             received: scenario.inputs.received(),
         })
@@ -370,6 +398,11 @@ impl<'a> Supervisor<'a> {
         if self.scenario.clock == ClockKind::Realtime {
             let lead_ns = if launch.host.is_some() { EPOCH_LEAD_HOSTS_NS } else { EPOCH_LEAD_NS };
             self.word.epoch_ns = monotonic_ns() + lead_ns;
+            if let Some(pace) = &self.pace {
+                // The frames of a device have their phase against the multiples of the period.
+                self.word.epoch_ns = self.word.epoch_ns.next_multiple_of(self.scenario.period_ns);
+                pace.run();
+            }
             scorer.start(Grid { epoch_ns: self.word.epoch_ns, period_ns: self.scenario.period_ns });
         }
         self.announce()?;

@@ -19,7 +19,7 @@ use crate::runtime::RoleId;
 use crate::scenario::{Scenario, claims};
 use crate::serial::LineCounters;
 use crate::system::utc;
-use crate::telemetry::{Grant, MachineInfo, RoleReport, WatchReport, write_hgrm, write_hlog};
+use crate::telemetry::{Grant, MachineInfo, PaceReport, RoleReport, WatchReport, write_hgrm, write_hlog};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::{self, BufWriter, Write};
@@ -96,6 +96,9 @@ pub struct Summary {
     /// The counters of the serial lines, by the body that a device simulates, since the last start of its bridge.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub lines: BTreeMap<String, LineCounters>,
+    /// The relation of the run's clock to the device that sets its pace, by the body that this device is.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub pace: BTreeMap<String, PaceReport>,
     /// The part of each host, if the run had several.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub hosts: Option<NetworkStatistics>,
@@ -213,6 +216,7 @@ impl Summary {
             latencies,
             late: outcome.late.as_ref().map(|late| late.worst(WORST)),
             lines: lines(&outcome.reports),
+            pace: paces(&outcome.reports),
             hosts: NetworkStatistics::merge(&outcome.hosts),
             recording: outcome.recording.clone(),
             privileges: privileges(outcome),
@@ -229,6 +233,10 @@ fn hosted(scenario: &Scenario) -> BTreeMap<String, String> {
 
 fn lines(reports: &[RoleReport]) -> BTreeMap<String, LineCounters> {
     reports.iter().filter_map(|report| Some((report.role.clone(), report.line?))).collect()
+}
+
+fn paces(reports: &[RoleReport]) -> BTreeMap<String, PaceReport> {
+    reports.iter().filter_map(|report| Some((report.role.clone(), report.pace.clone()?))).collect()
 }
 
 fn privileges(outcome: &Outcome) -> Vec<RoleGrant> {

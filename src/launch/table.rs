@@ -6,7 +6,7 @@ use crate::analysis::digits;
 use crate::hosts::{NetworkStatistics, Silence};
 use crate::late::{late_table, pattern};
 use crate::serial::LineCounters;
-use crate::telemetry::Percentiles;
+use crate::telemetry::{PaceReport, Percentiles};
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use std::collections::BTreeMap;
@@ -70,6 +70,9 @@ pub fn table(summary: &Summary, all: bool) -> String {
     for line in lines.filter(|line| all || !line.ends_with(NO_FAULT)) {
         let _ = writeln!(text, "{line}");
     }
+    for (role, pace) in &summary.pace {
+        let _ = writeln!(text, "{}", pace_words(role, pace));
+    }
     summary.hosts.iter().for_each(|summary| hosts(summary, &mut text));
     privileges(summary, all, &mut text);
     text.lines().flat_map(|line| [line.trim_end(), "\n"]).collect()
@@ -106,6 +109,20 @@ pub fn line_words(body: &str, counters: &LineCounters) -> String {
     let ill: Vec<String> =
         ill.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}")).collect();
     if ill.is_empty() { format!("{well}{NO_FAULT}") } else { format!("{well}\n  {}", ill.join(", ")) }
+}
+
+/// Returns the relation of a run's clock to the device that sets its pace, in words.
+pub fn pace_words(role: &str, pace: &PaceReport) -> String {
+    let us = |value: Option<f64>| value.map_or("-".to_owned(), |us| format!("{us:.1}"));
+    let [p50, p99, max] = [pace.phase_error_p50_us, pace.phase_error_p99_us, pace.phase_error_max_us].map(us);
+    let holdovers = match pace.holdovers {
+        0 => String::new(),
+        count => format!(", {count} holdovers ({:.1} s)", pace.holdover_s),
+    };
+    format!(
+        "pace of {role}: {}, phase error p50 {p50}, p99 {p99}, max {max} us,\n  drift {:+.1} ppm, {} slips{holdovers}",
+        pace.state, pace.drift_ppm, pace.slips
+    )
 }
 
 fn results(summary: &Summary, all: bool, text: &mut String) {

@@ -2,8 +2,8 @@
 
 use super::output::{CommandResult, Exit, Failure, fail, say};
 use super::runs::join;
-use crate::launch::line_words;
-use crate::runtime::{DeviceConfig, DeviceError, LineAddress, NodeError};
+use crate::launch::{line_words, pace_words};
+use crate::runtime::{DeviceConfig, DeviceError, LineAddress, NodeError, OnLost, PaceOptions};
 use crate::seat::{BridgeResult, RoleError, run_bridge};
 use crate::system::tell;
 use std::net::SocketAddr;
@@ -37,12 +37,35 @@ pub struct Arguments {
     /// Continue if a device of another name answers during the run
     #[arg(long)]
     allow_other_device: bool,
+    /// Clock of the run: that of the host, or of the device, which sends a frame in each of its cycles
+    #[arg(long, value_name = "CLOCK", default_value = "host")]
+    pace: PaceBy,
+    /// With `--pace device`, keep the pace of a silent device for this time, s
+    #[arg(long, value_name = "S", default_value_t = 5.0, value_parser = seconds)]
+    holdover: f64,
+    /// With `--pace device`, then send no commands until the device is followed again (safe), or end the run (stop)
+    #[arg(long, value_name = "POLICY", default_value = "safe")]
+    on_lost: LostPolicy,
     /// Print the line's counters as one JSON object (corotate/bridge/v1)
     #[arg(long)]
     json: bool,
     /// Die with this process
     #[arg(long, value_name = "PID", hide = true)]
     parent: Option<i32>,
+}
+
+/// The clock of a run.
+#[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum PaceBy {
+    Host,
+    Device,
+}
+
+/// The reaction to a device that is silent for longer than the holdover.
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum LostPolicy {
+    Safe,
+    Stop,
 }
 
 /// Layout version of the JSON.
@@ -58,6 +81,14 @@ fn seconds(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|error| format!("{error}; give a number of seconds"))?;
     let sensible = (0.001..=86_400.0).contains(&value);
     sensible.then_some(value).ok_or_else(|| "give 0.001 to 86400 s".to_owned())
+}
+
+fn pace_options(arguments: &Arguments) -> PaceOptions {
+    let on_lost = match arguments.on_lost {
+        LostPolicy::Safe => OnLost::Safe,
+        LostPolicy::Stop => OnLost::Stop,
+    };
+    PaceOptions { holdover_s: arguments.holdover, on_lost }
 }
 
 /// Returns the place of the device.
@@ -86,16 +117,19 @@ pub fn bridge(arguments: &Arguments) -> CommandResult {
         line,
         patience_s: arguments.patience,
         other_device: arguments.allow_other_device,
+        pace: (arguments.pace == PaceBy::Device).then(|| pace_options(arguments)),
     };
     let role = device.roles.join(",");
     let welcomed = |name: &str| tell(format_args!("{role} on {}: {name}", device.line));
     let served = run_bridge(&device, &terminated, welcomed).map_err(|error| fail(exit_of(&error), error))?;
-    let Some(BridgeResult { counters, outages, lost }) = served else { return Ok(Exit::Ok) };
+    let Some(BridgeResult { counters, outages, pace, lost }) = served else { return Ok(Exit::Ok) };
     if arguments.json {
-        let object = serde_json::json!({ "schema": SCHEMA, "role": role, "line": counters, "outages": outages });
+        let object =
+            serde_json::json!({ "schema": SCHEMA, "role": role, "line": counters, "outages": outages, "pace": pace });
         say(&format!("{object}\n"))?;
     } else {
         tell(line_words(&role, &counters));
+        pace.iter().for_each(|pace| tell(pace_words(&role, pace)));
     }
     Ok(lost.map_or(Exit::Ok, |lost| fail(Exit::ProcessLost, Failure::new("device-lost", format!("{role}: {lost}")))))
 }

@@ -105,6 +105,12 @@ fn json(model: &Model) -> String {
         "ended": model.ended,
         "roles": model.roles.iter().map(role).collect::<Vec<_>>(),
         "late": model.late,
+        "pace": model.pace.map(|pace| serde_json::json!({
+            "state": <&str>::from(pace.state),
+            "phase_error_us": pace.phase_error_ns as f64 / 1e3,
+            "drift_ppm": pace.drift_ppm,
+            "slips": pace.slips,
+        })),
         "errors": model.series.iter().map(|series| (&series.name, series.last)).collect::<BTreeMap<_, _>>(),
         "events": model.events.iter().map(|event| serde_json::json!({ "tick": event.tick, "text": event.text })).collect::<Vec<_>>(),
         "signals": model.signals.iter().map(|signal| (&signal.name, fields(&signal.fields))).collect::<BTreeMap<_, _>>(),

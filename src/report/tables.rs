@@ -7,7 +7,7 @@ use crate::analysis::{Claim, Reach, apart, digits};
 use crate::hosts::{HostStatistics, LinkStatistics, Silence};
 use crate::launch::{Criterion, Incident, LinkCounters, StageFigures, State, exact, reasons, short};
 use crate::rig::{ConditionReport, Figure};
-use crate::telemetry::{MachineInfo, Percentiles, Ticks};
+use crate::telemetry::{MachineInfo, PaceReport, Percentiles, Ticks};
 
 /// An injected fault of the scenario.
 #[derive(Debug)]
@@ -195,6 +195,38 @@ fn ticks_row((role, ticks): (&String, &Ticks)) -> Vec<String> {
     strings(&[role, elapsed, executed, missed, starved, &late, safe, stalled])
 }
 
+/// Builds the table of the device that sets the pace, if one does.
+fn paces(source: &Source) -> Option<Block> {
+    let paces = source.summary.as_ref().map(|summary| &summary.pace).filter(|paces| !paces.is_empty())?;
+    let row = |(role, pace): (&String, &PaceReport)| {
+        strings(&[
+            role,
+            &pace.state,
+            &number(pace.locked_after_s),
+            &number(pace.phase_error_p50_us),
+            &number(pace.phase_error_p99_us),
+            &number(pace.phase_error_max_us),
+            &number(Some(pace.drift_ppm)),
+            &pace.slips,
+            &number(Some(pace.holdover_s)),
+            &number(pace.relocked_after_s_max),
+        ])
+    };
+    let head = vec![
+        "device",
+        "state",
+        "locked after, s",
+        "phase error p50, µs",
+        "p99, µs",
+        "max, µs",
+        "drift, ppm",
+        "slips",
+        "holdover, s",
+        "locked again after, s",
+    ];
+    Some(Block::table("Pace", head, paces.iter().map(row).collect()))
+}
+
 /// Builds the section with the counters of roles, links, hosts and the recording.
 pub fn books(source: &Source) -> Section {
     let mut blocks = Vec::new();
@@ -248,6 +280,7 @@ pub fn books(source: &Source) -> Section {
         let rows = end.ticks.iter().map(ticks_row).collect();
         blocks.push(Block::table("Ticks", roles.to_vec(), rows));
     }
+    blocks.extend(paces(source));
     blocks.extend(hosts(source));
     blocks.extend(recorded(source));
     if let Some((summary, state)) = source.summary.as_ref().map(|summary| (summary, &summary.state)) {

@@ -4,6 +4,7 @@
 
 use super::tune::TuneView;
 use crate::late::LateStatus;
+use crate::runtime::PaceStatus;
 use crate::sample::RoleState;
 use crate::telemetry::{quantile, sorted};
 use std::collections::VecDeque;
@@ -40,6 +41,8 @@ pub struct Model {
     pub roles: Vec<RoleLine>,
     /// The late ticks, in real time.
     pub late: Option<LateStatus>,
+    /// The relation of the grid to the device that sets the pace, if one does.
+    pub pace: Option<PaceStatus>,
     /// The errors, and V if the law has one.
     pub series: Vec<Series>,
     /// The events, the newest last.

@@ -3,6 +3,7 @@
 use super::model::{Model, RoleLine, Series};
 use super::tune::TuneView;
 use crate::late::{LastLate, LateKind, LateStatus};
+use crate::runtime::{PaceState, PaceStatus};
 use crate::sample::RoleState;
 use ratatui::backend::TestBackend;
 use ratatui::layout::{Constraint, Layout, Rect};
@@ -42,9 +43,10 @@ pub fn draw(model: &Model, frame: &mut Frame<'_>) {
         return;
     }
     let roles = (model.roles.len() as u16).min(ROLES + area.height.saturating_sub(USUAL_HEIGHT) / 2);
-    let late = late_line(model, usize::from(area.width));
-    // It has the place of one event.
-    let (late_height, events_min) = if late.is_some() { (1, EVENTS_MIN - 1) } else { (0, EVENTS_MIN) };
+    let late = pace_line(model).into_iter().chain(late_line(model, usize::from(area.width))).collect::<Vec<_>>();
+    // Each has the place of one event.
+    let late_height = late.len() as u16;
+    let events_min = EVENTS_MIN.saturating_sub(late_height).max(1);
     let roles_height = 1 + roles + late_height;
     // A sparkline has two lines if they fit.
     let fixed = 1 + roles_height + 1 + (1 + events_min) + (1 + FIELDS_MIN) + 1;
@@ -168,6 +170,21 @@ fn late_line(model: &Model, width: usize) -> Option<Line<'static>> {
     let cause = cause.as_deref().unwrap_or("unknown cause");
     let text = format!("{count} late ticks, {which}: {role} {kind}{tick}, {} us: {cause}", short(*late_us));
     Some(Line::raw(cut(&text, width)))
+}
+
+/// Returns the relation of the grid to the device that sets the pace, if one does.
+fn pace_line(model: &Model) -> Option<Line<'static>> {
+    let PaceStatus { state, phase_error_ns, drift_ppm, slips } = model.pace?;
+    let name: &str = state.into();
+    let style = if state == PaceState::Locked { Style::new() } else { ALARM };
+    Some(Line::from(vec![
+        Span::raw("pace: "),
+        Span::styled(name.to_owned(), style),
+        Span::raw(format!(
+            ", phase error {:+.1} us, drift {drift_ppm:+.1} ppm, {slips} slips",
+            phase_error_ns as f64 / 1e3
+        )),
+    ]))
 }
 
 /// Formats a number of µs in few columns.

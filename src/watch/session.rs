@@ -11,7 +11,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::late::LateFollower;
-use crate::runtime::{depths, join_at_low_priority, topic, with_realtime_priority};
+use crate::runtime::{PaceBoard, depths, join_at_low_priority, topic, with_realtime_priority};
 use crate::sample::{Phase, Schedule};
 use crate::scenario::Scenario;
 use crate::seat::{RoleError, find_run, join_complete};
@@ -36,6 +36,7 @@ struct Joined {
     feed: Feed,
     schedule: <IoxBus as Bus>::Reader<Schedule>,
     late: Option<LateFollower>,
+    pace: Option<PaceBoard>,
     _bus: IoxBus,
 }
 
@@ -49,7 +50,9 @@ impl Joined {
         let bus = retry(&may_wait, || IoxBus::join(domain, "watch", depths(scenario)))?;
         let feed = retry(&may_wait, || Feed::open(scenario, &bus, model))?;
         let schedule = bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?;
-        Ok(Self { feed, schedule, late: LateFollower::open(domain, scenario), _bus: bus })
+        // A watcher of a run without such a device shows nothing.
+        let pace = PaceBoard::existing(domain).unwrap_or_default();
+        Ok(Self { feed, schedule, late: LateFollower::open(domain, scenario), pace, _bus: bus })
     }
 }
 
@@ -82,13 +85,14 @@ impl Session {
     /// # Errors
     /// [`WatchError::Bus`].
     pub fn poll(&mut self) -> Result<(), WatchError> {
-        let Some(Joined { feed, schedule, late, .. }) = &mut self.joined else { return Ok(()) };
+        let Some(Joined { feed, schedule, late, pace, .. }) = &mut self.joined else { return Ok(()) };
         while schedule.advance()? {}
         let current = schedule.current().copied().unwrap_or_default();
         let phase = Phase::from_number(current.phase);
         let grid = Grid { epoch_ns: current.epoch_ns, period_ns: self.scenario.period_ns };
         feed.poll((phase >= Phase::Run).then_some(grid), &mut self.model)?;
         self.model.late = late.as_mut().map(|late| late.poll(&self.scenario).clone());
+        self.model.pace = pace.as_ref().and_then(PaceBoard::status);
         if phase == Phase::Stop || !self.domain.exists() {
             self.leave();
         }

@@ -224,6 +224,7 @@ fn link_device(scenario: &Scenario, roles: &[RoleId], path: &Path) -> RoleImpl {
         line: LineAddress::Serial { path: path.to_owned(), baud: None },
         patience_s: 60.0,
         other_device: false,
+        pace: None,
     };
     let mut link = DeviceLink::open(&config, scenario, roles, 1).unwrap();
     assert!(link.greet(None, &AtomicBool::new(false)).unwrap().is_some());

@@ -16,6 +16,7 @@ mod late;
 mod one_plant;
 mod one_process;
 mod own_rig;
+mod pace;
 mod processes;
 mod rates;
 mod serial;

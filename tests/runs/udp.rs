@@ -22,8 +22,8 @@ const LOOK: Duration = Duration::from_millis(1);
 const OVERTAKEN: Duration = Duration::from_millis(15);
 
 /// A thread that runs until it is dropped.
-struct Service {
-    address: SocketAddr,
+pub(super) struct Service {
+    pub address: SocketAddr,
     on: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -39,7 +39,7 @@ impl Service {
     }
 
     /// Starts the follower of `rigid-pair`.
-    fn device(own: &str) -> Self {
+    pub fn device(own: &str) -> Self {
         Self::new(own, |socket, on| {
             let (mut device, mut bytes, began) =
                 (Device::new(NAME, Follower::asked_for), [0; MAX_FRAME], Instant::now());

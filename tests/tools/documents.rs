@@ -10,7 +10,7 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 
 /// Commands that are not run here: first words, and where the command is run or why it cannot be.
-const ELSEWHERE: [(&str, &str); 33] = [
+const ELSEWHERE: [(&str, &str); 34] = [
     ("corotate run pair.toml --host", "it waits for another host; tests/runs/hosts"),
     ("corotate run pair.toml --clock lockstep --debug", "it waits for a debugger; tests/runs/debugging.rs"),
     ("corotate join", "it needs a run to join; tests/runs/hosts"),
@@ -33,6 +33,7 @@ const ELSEWHERE: [(&str, &str); 33] = [
     ("corotate run tests/hil/pair.toml --clock lockstep", "it waits for a partner; tests/runs/hil.rs"),
     ("$(tests/hil/venv) tests/hil/follower.py", "tests/runs/hil.rs"),
     ("corotate bridge --serial", "it needs a device; tests/runs/serial.rs"),
+    ("corotate bridge --udp", "it needs a device; tests/runs/pace.rs"),
     ("qemu-system-arm", "it needs firmware; tests/board"),
     ("socat", "it goes on until it is ended; tests/runs/serial.rs has a line of its own"),
     ("cargo run --release --example serial_device", "it needs a line; tests/runs/serial.rs"),

@@ -175,6 +175,7 @@ impl<'a, R: Rig> Run<'a, R> {
             grants: Vec::new(),
             line: None,
             outages: Vec::new(),
+            pace: None,
             late_inputs: 0,
             late_ticks: Vec::new(),
         }

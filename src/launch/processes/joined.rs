@@ -44,6 +44,7 @@ impl<'a> Supervisor<'a> {
             foxglove,
             relay,
             tracer: TracerWatch::none()?,
+            pace: None,
             inputs: None,
             received: scenario.inputs.received(),
         })

@@ -76,6 +76,15 @@ pub enum DeviceEvent<'a> {
     Answer(Answer<'a>),
 }
 
+/// The cycle of a device, by its own timer, in which it sent a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Cycle {
+    /// A cycle before the first tick, by the sequence number of its frame: the device counts its cycles by it.
+    Idle(u32),
+    /// The cycle of a tick.
+    Tick(u64),
+}
+
 /// The terms of a run that the host needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Terms {
@@ -131,6 +140,41 @@ pub struct HostSession {
     /// The smoothed round-trip time, ns.
     round_trip_ns: u64,
     counters: LineCounters,
+    /// True if the device sets the pace.
+    follows: bool,
+    /// The cycle of the last received frame, until it is taken.
+    cycle: Option<Cycle>,
+    slips: Slips,
+}
+
+/// The cycles that a device executed without the request that was sent for them.
+#[derive(Debug, Default)]
+struct Slips {
+    count: u64,
+    /// The last tick of which an answer came, and the last that slipped.
+    newest_tick: Option<u64>,
+    slipped_tick: Option<u64>,
+}
+
+impl Slips {
+    /// Takes an answer, with the request that it answers, if that is the current one. `repeated` is true if its tick was
+    /// answered before, `echoes` if it is the first answer to its frame.
+    fn take(&mut self, answer: &Answer<'_>, request: Option<&Request>, repeated: bool, echoes: bool) {
+        let news = self.newest_tick < Some(answer.tick);
+        self.newest_tick = self.newest_tick.max(Some(answer.tick));
+        let slipped = match request {
+            // Its cycle began before the request was sent.
+            Some(request) => answer.event.missed() && request.present > 0 && request.sent == 0,
+            // The request came after its cycle.
+            None if repeated => answer.event.missed() && echoes,
+            // The request was not sent, or the frame came after the cutoff.
+            None => news,
+        };
+        if slipped && self.slipped_tick < Some(answer.tick) {
+            self.count += 1;
+            self.slipped_tick = Some(answer.tick);
+        }
+    }
 }
 
 impl HostSession {
@@ -151,7 +195,26 @@ impl HostSession {
             sent: [None; REMEMBERED],
             round_trip_ns: 0,
             counters: LineCounters::default(),
+            follows: false,
+            cycle: None,
+            slips: Slips::default(),
         }
+    }
+
+    /// Declares that the device sets the pace: it answers at its own cycles, and requests never wait for an answer.
+    pub fn follow(&mut self) {
+        self.follows = true;
+    }
+
+    /// Returns the cycle of the last received frame, once.
+    pub fn take_cycle(&mut self) -> Option<Cycle> {
+        self.cycle.take()
+    }
+
+    /// Returns the number of cycles that the device executed without the request that the host had sent, or was about to
+    /// send, for them. Lost requests do not count.
+    pub fn slips(&self) -> u64 {
+        self.slips.count
     }
 
     /// Returns true if the device takes part.
@@ -206,7 +269,7 @@ impl HostSession {
 
     /// Processes one received byte. Returns the event that it completes, if any.
     pub fn push(&mut self, byte: u8, now_ns: u64) -> Option<DeviceEvent<'_>> {
-        let Self { terms, decoder, newest_sequence, counters, .. } = self;
+        let Self { terms, decoder, newest_sequence, counters, slips, .. } = self;
         let payload = decoder.push(byte)?;
         let (sequence, message) = match parse(payload) {
             Ok(parsed) => parsed,
@@ -219,6 +282,7 @@ impl HostSession {
         match message {
             Message::Hello(_) | Message::Tick(_) | Message::Stop => counters.echoes += 1,
             Message::Welcome(welcome) if welcome.run == terms.run => {
+                self.cycle = (welcome.next_tick == 0).then_some(Cycle::Idle(sequence));
                 // A greeted device that sends another Welcome has received two greetings.
                 let restarted = !self.greeted && self.answered.is_some_and(|answered| welcome.next_tick <= answered);
                 if restarted {
@@ -259,12 +323,18 @@ impl HostSession {
                 if let Some((_, sent_ns)) = sent {
                     smooth(&mut self.round_trip_ns, now_ns.saturating_sub(sent_ns));
                 }
-                match self.request.take_if(|request| request.tick == answer.tick) {
+                self.cycle = Some(Cycle::Tick(answer.tick));
+                let request = self.request.take_if(|request| request.tick == answer.tick);
+                let repeated = self.answered == Some(answer.tick);
+                if self.follows {
+                    slips.take(&answer, request.as_ref(), repeated, sent.is_some());
+                }
+                match request {
                     Some(_) => {
                         self.answered = Some(answer.tick);
                         return Some(DeviceEvent::Answer(answer));
                     }
-                    None if self.answered.is_some_and(|tick| answer.tick == tick) => counters.duplicates += 1,
+                    None if repeated => counters.duplicates += 1,
                     None => counters.late += 1,
                 }
             }
@@ -303,6 +373,11 @@ impl HostSession {
         self.silent_since_ns = None;
     }
 
+    /// Returns the number of handshakes with a device that had lost the run.
+    pub fn restarts(&self) -> u64 {
+        self.counters.restarts
+    }
+
     /// Returns the terms of the run.
     pub fn terms(&self) -> &Terms {
         &self.terms
@@ -332,7 +407,7 @@ impl HostSession {
     /// works on an earlier tick would be late for this one, and for each after it. After a period it is asked
     /// nevertheless: the earlier request may be lost.
     fn free_ns(&self) -> u64 {
-        let Some(period_ns) = self.terms.period_ns else { return 0 };
+        let Some(period_ns) = self.terms.period_ns.filter(|_| !self.follows) else { return 0 };
         let wait_ns = self.repeat_ns().min(period_ns);
         self.sent.iter().flatten().map(|(_, sent_ns)| sent_ns + wait_ns).max().unwrap_or(0)
     }
@@ -366,4 +441,96 @@ fn count_gap(newest_sequence: &mut Option<u32>, counters: &mut LineCounters, seq
 
 fn smooth(mean_ns: &mut u64, value_ns: u64) {
     *mean_ns = if *mean_ns == 0 { value_ns } else { *mean_ns - (*mean_ns >> SMOOTHING) + (value_ns >> SMOOTHING) };
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::role::CommandEvent;
+
+    const HELLO: Hello<'_> = Hello {
+        run: 7,
+        realtime: true,
+        period_ns: 2_000_000,
+        last_tick: 1000,
+        timeout_ticks: 20,
+        manual_rearm: false,
+        role: "body",
+        reads: "",
+        writes: "",
+    };
+
+    /// The host's end, with a device that counts its cycles.
+    struct Line {
+        host: HostSession,
+        sequence: u32,
+        now_ns: u64,
+    }
+
+    impl Line {
+        fn greeted() -> Self {
+            let terms = Terms { run: 7, period_ns: Some(HELLO.period_ns), outputs: [0; MAX_SAMPLES], required: 0 };
+            let mut line = Self { host: HostSession::new(terms), sequence: 0, now_ns: 0 };
+            line.host.follow();
+            assert!(line.host.due(0, &HELLO).is_some());
+            line.arrive(Message::Welcome(Welcome { run: 7, next_tick: 0, device: "test" }));
+            assert_eq!((line.host.take_cycle(), line.host.take_cycle()), (Some(Cycle::Idle(0)), None));
+            line
+        }
+
+        fn arrive(&mut self, message: Message<'_>) {
+            let (mut payload, mut frame) = ([0; MAX_PAYLOAD], [0; MAX_FRAME]);
+            let frame = encode(write(self.sequence, message, &mut payload).unwrap(), &mut frame).unwrap();
+            self.sequence += 1;
+            frame.iter().for_each(|byte| _ = self.host.push(*byte, self.now_ns));
+        }
+
+        /// Lets the request of a tick fall due. Returns its sequence, if it was `sent`.
+        fn request(&mut self, tick: u64, sent: bool) -> u32 {
+            self.now_ns += HELLO.period_ns;
+            self.host.request(tick, Samples { present: 1, bytes: &[1; 8] }, self.now_ns);
+            let sequence = self.host.sequence;
+            assert!(!sent || self.host.due(self.now_ns, &HELLO).is_some());
+            sequence
+        }
+
+        fn answer(&mut self, echo: u32, tick: u64, event: CommandEvent) {
+            self.arrive(Message::Answer(Answer { echo, tick, event, outputs: Samples::default() }));
+            assert_eq!(self.host.take_cycle(), Some(Cycle::Tick(tick)));
+        }
+    }
+
+    #[test]
+    fn a_cycle_slips_if_its_request_came_too_late() {
+        let mut line = Line::greeted();
+        let first = line.request(0, true);
+        line.answer(first, 0, CommandEvent::NotDue);
+        // The request is lost.
+        line.request(1, true);
+        line.answer(first, 1, CommandEvent::Held);
+        assert_eq!(line.host.slips(), 0);
+        // The request comes after its cycle: the device answers it again, and the network doubles that answer.
+        let late = line.request(2, true);
+        line.answer(first, 2, CommandEvent::Held);
+        assert_eq!(line.host.slips(), 0);
+        line.answer(late, 2, CommandEvent::Held);
+        line.answer(late, 2, CommandEvent::Held);
+        assert_eq!(line.host.slips(), 1);
+        // This host wakes after the cycle.
+        line.request(3, false);
+        line.answer(late, 3, CommandEvent::Held);
+        assert_eq!(line.host.slips(), 2);
+        // It sleeps for two cycles, and gives up a third.
+        line.answer(late, 4, CommandEvent::Held);
+        line.answer(late, 5, CommandEvent::Held);
+        let sent = line.request(6, true);
+        line.host.give_up();
+        line.answer(sent, 6, CommandEvent::Applied);
+        assert_eq!(line.host.slips(), 5);
+        // An overtaken frame is not news.
+        line.answer(late, 4, CommandEvent::Held);
+        let sent = line.request(7, true);
+        line.answer(sent, 7, CommandEvent::Applied);
+        assert_eq!(line.host.slips(), 5);
+    }
 }

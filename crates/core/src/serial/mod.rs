@@ -21,7 +21,7 @@ mod tests;
 
 pub use device::Device;
 pub use frame::{CRC, Decoder, FrameCounters, MAX_FRAME, MAX_PAYLOAD, TooLong, encode};
-pub use host::{DeviceEvent, HostSession, LineCounters, Terms};
+pub use host::{Cycle, DeviceEvent, HostSession, LineCounters, Terms};
 pub use message::{
     Answer, Hello, MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, MAX_TEXT, Message, ParseError, Reason, Refuse, Samples, Tick,
     VERSION, Welcome, parse, write,

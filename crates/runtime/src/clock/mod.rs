@@ -1,10 +1,14 @@
 //! The time grid T_k = epoch + k·h and waiting on it. Deadlines are absolute: a relative sleep would drift.
 
+mod arrivals;
 mod grid;
+mod minimum;
 mod run_clock;
 
+pub use arrivals::{ArrivalEstimate, ArrivalEstimator};
 pub use grid::Grid;
-pub use run_clock::{Correction, RunClock, STEEPEST, adopt};
+pub use minimum::{MinimumFilter, Observation, OffsetLine};
+pub use run_clock::{Correction, RunClock, STEEPEST, adopt, release};
 
 use rustix::thread::clock_nanosleep_absolute;
 use rustix::time::{ClockId, DynamicClockId, Timespec, clock_gettime, clock_gettime_dynamic};
@@ -35,6 +39,11 @@ impl Clock {
 pub fn monotonic_ns() -> u64 {
     let raw_ns = raw_ns();
     run_clock::correction().map_or(raw_ns, |correction| correction.apply(raw_ns))
+}
+
+/// Returns the clock of the run less this host's own CLOCK_MONOTONIC at present, ns.
+pub fn correction_ns() -> i64 {
+    run_clock::correction().map_or(0, |correction| correction.at(raw_ns()))
 }
 
 /// Returns the time on this host's own CLOCK_MONOTONIC, ns.

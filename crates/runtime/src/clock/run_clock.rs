@@ -8,7 +8,7 @@ use crate::shared::SharedWords;
 use std::io;
 use std::path::Path;
 use std::sync::OnceLock;
-use std::sync::atomic::{AtomicU64, Ordering, fence};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering, fence};
 
 /// Number of lines written. Its parity selects the current of two slots; the next line goes into the other slot.
 const SEQUENCE: usize = 0;
@@ -34,7 +34,12 @@ impl Correction {
     /// Creates a line through `offset_ns` at `reference_ns`, with a slope in ns per ns that is limited to
     /// ±[`STEEPEST`].
     pub fn new(reference_ns: u64, offset_ns: i64, slope: f64) -> Self {
-        let slope = (slope.clamp(-STEEPEST, STEEPEST) * (1_u64 << FRACTION) as f64) as i64;
+        Self::within(reference_ns, offset_ns, slope, STEEPEST)
+    }
+
+    /// Creates a line with a slope that is limited to ±`steepest` ns per ns, which is below 1 so that time never goes back.
+    pub fn within(reference_ns: u64, offset_ns: i64, slope: f64, steepest: f64) -> Self {
+        let slope = (slope.clamp(-steepest, steepest) * (1_u64 << FRACTION) as f64) as i64;
         Self { reference_ns, offset_ns, slope }
     }
 
@@ -57,6 +62,14 @@ impl Correction {
 pub struct RunClock(SharedWords);
 
 impl RunClock {
+    /// The file name of a clock that a device may set.
+    pub const PACE: &'static str = "pace";
+
+    /// Makes this process the only writer until it ends; returns false if another process is.
+    pub fn own(&self) -> bool {
+        self.0.file().try_lock().is_ok()
+    }
+
     /// Opens the correction in a file; creates one without effect if the file is missing.
     ///
     /// # Errors
@@ -108,25 +121,43 @@ impl RunClock {
     }
 }
 
-static OF_THIS_PROCESS: OnceLock<RunClock> = OnceLock::new();
+/// The clocks that this process has used, in turn, and the number of the present one; number 0 stays empty.
+static USED: [OnceLock<RunClock>; USED_MAX] = [const { OnceLock::new() }; USED_MAX];
+static PRESENT: AtomicUsize = AtomicUsize::new(0);
+/// The most clocks that a process uses: it may launch one run after the other.
+const USED_MAX: usize = 256;
 
-/// Makes this process use the correction in a file permanently, if the file exists.
+/// Makes this process use the correction in a file, if the file exists, until [`release`]. A process takes part in one run
+/// at a time that has such a file.
 ///
 /// # Errors
-/// The system's reason, except for a missing file.
+/// The system's reason, except for a missing file; also after 255 clocks.
 pub fn adopt(path: &Path) -> io::Result<()> {
-    match RunClock::existing(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
-        clock => clock.map(|clock| {
-            let _ = OF_THIS_PROCESS.set(clock);
-        }),
+    let mut clock = match RunClock::existing(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+        clock => clock?,
+    };
+    for (number, place) in USED.iter().enumerate().skip(1) {
+        match place.set(clock) {
+            Ok(()) => {
+                PRESENT.store(number, Ordering::Release);
+                return Ok(());
+            }
+            Err(refused) => clock = refused,
+        }
     }
+    Err(io::Error::other("this process has used too many clocks of runs; start another one"))
+}
+
+/// Makes this process use its monotonic clock again.
+pub fn release() {
+    PRESENT.store(0, Ordering::Release);
 }
 
 /// Returns the correction of this process's clock; `None` in a run on one host, and on the launching host.
 #[inline]
 pub(super) fn correction() -> Option<Correction> {
-    OF_THIS_PROCESS.get().map(RunClock::get)
+    USED.get(PRESENT.load(Ordering::Acquire)).and_then(OnceLock::get).map(RunClock::get)
 }
 
 #[cfg(test)]

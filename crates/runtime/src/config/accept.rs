@@ -32,6 +32,8 @@ pub struct Accept {
     pub unscored_ticks_max: Option<TickAmount>,
     /// Limits of latencies by their keys, µs.
     pub latency_max_us: Vec<(&'static str, f64)>,
+    /// Limits of the pace of a device by their keys.
+    pub pace_max: Vec<(&'static str, f64)>,
     /// Limits of the responses to steps of inputs by their keys.
     pub response_max: Vec<(&'static str, f64)>,
 }
@@ -74,6 +76,7 @@ impl Accept {
             && ticks.into_iter().all(Option::is_none)
             && self.unscored_ticks_max.is_none()
             && self.latency_max_us.is_empty()
+            && self.pace_max.is_empty()
             && self.response_max.is_empty()
     }
 
@@ -125,10 +128,11 @@ pub(crate) fn resolve(raw: &Raw, metrics: &toml::Table, setting: &Setting<'_>, c
         ),
         late_ticks_max: limit("late_ticks_max", raw.late_ticks_max.as_ref(), setting.roles, checks),
         latency_max_us: raw.latencies().collect(),
+        pace_max: raw.paces().collect(),
         response_max: raw.responses().collect(),
         ..Accept::default()
     };
-    for (key, limit) in accept.latency_max_us.iter().chain(&accept.response_max) {
+    for (key, limit) in accept.latency_max_us.iter().chain(&accept.pace_max).chain(&accept.response_max) {
         not_negative(&format!("accept.{key}"), *limit, checks);
     }
     if let [(STEP, _)] = accept.latency_max_us[..]

@@ -306,6 +306,10 @@ pub(crate) struct Accept {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lateness_max_us: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
+    pub phase_error_p99_us_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub slips_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub rise_time_s_max: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub overshoot_max: Option<f64>,
@@ -333,6 +337,12 @@ impl Accept {
 }
 
 impl Accept {
+    /// Returns the keys and limits of the pace of a device.
+    pub fn paces(&self) -> impl Iterator<Item = (&'static str, f64)> {
+        let limits = [("phase_error_p99_us_max", self.phase_error_p99_us_max), ("slips_max", self.slips_max)];
+        limits.into_iter().filter_map(|(key, limit)| Some((key, limit?)))
+    }
+
     /// Returns the keys and limits of responses to steps of inputs.
     pub fn responses(&self) -> impl Iterator<Item = (&'static str, f64)> {
         let limits = [

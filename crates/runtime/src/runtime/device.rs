@@ -7,9 +7,10 @@ use super::absence::Absences;
 use super::error::DeviceError;
 use super::line::{Line, LineAddress};
 use super::node::ports;
+use super::pace::{Pace, PaceOptions, PaceState};
 use super::role_id::RoleId;
 use crate::bus::Port;
-use crate::clock::{monotonic_ns, sleep_until};
+use crate::clock::{Grid, monotonic_ns, raw_ns, sleep_until};
 use crate::config::{ClockKind, Rates, Settings};
 use crate::role::Rearm;
 use crate::sample::{Stamp, type_name_of};
@@ -17,7 +18,7 @@ use crate::serial::{
     Answer, DeviceEvent, Hello, HostSession, LineCounters, MAX_CONTENT, MAX_FRAME, MAX_NAMES, MAX_SAMPLES, Reason,
     Refuse, Samples, Terms, Welcome,
 };
-use crate::telemetry::Outage;
+use crate::telemetry::{Outage, PaceReport};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -30,6 +31,15 @@ const BARE_NS: u64 = 1_000_000_000;
 /// Bytes per read, and reads per turn: garbage must not delay a tick, and a datagram is read whole.
 const CHUNK: usize = MAX_FRAME;
 const CHUNKS: usize = 4;
+/// Pause between two polls of the line while the pace of a device is awaited, ns.
+const LOOK_PACE_NS: u64 = 100_000;
+/// The longest wait for the first frame of a device that sets the pace, ns and periods, and the longest wait for its pace
+/// as a multiple of that: both machines may be loaded.
+const PACE_NS: u64 = 5_000_000_000;
+const PACE_PERIODS: u64 = 100;
+const PACE_LOADED: u64 = 6;
+/// Turns in which the frames that came during the start are taken.
+const DRAIN_TURNS: usize = 200;
 /// Bits on the line per byte: start, eight data bits, stop.
 const BITS_PER_BYTE: u64 = 10;
 /// Lower bound on the bytes of a frame besides its samples: delimiters, COBS, CRC, numbers.
@@ -48,6 +58,8 @@ pub struct DeviceConfig {
     pub patience_s: f64,
     /// True to accept a device with another name during the run.
     pub other_device: bool,
+    /// The settings if the device sets the pace.
+    pub pace: Option<PaceOptions>,
 }
 
 /// The content of the greeting.
@@ -151,6 +163,8 @@ pub struct DeviceLink {
     device: Option<String>,
     other_device: bool,
     absences: Absences,
+    /// Present if the device sets the pace.
+    pace: Option<Box<Pace>>,
 }
 
 impl DeviceLink {
@@ -206,7 +220,64 @@ impl DeviceLink {
             device: None,
             other_device: config.other_device,
             absences: Absences::new(terms.period_ns, scenario.command_timeout_ticks),
+            pace: None,
         })
+    }
+
+    /// Lets the greeted device set the pace: waits until the run's clock follows its frames. Returns false if `terminated`
+    /// is set first.
+    ///
+    /// # Errors
+    /// [`DeviceError`]; [`DeviceError::NoPace`] if the device sends no frames by its own timer.
+    pub fn follow(&mut self, pace: Pace, terminated: &AtomicBool) -> Result<bool, DeviceError> {
+        let (began_ns, period_ns) = (raw_ns(), self.greeting.period_ns);
+        self.host.follow();
+        let pace = self.pace.insert(Box::new(pace));
+        // Once ticks run, frames have the number of their tick, and the grid is locked while it runs.
+        if pace.begins_late() {
+            return Ok(true);
+        }
+        let limit_ns = PACE_NS.max(PACE_PERIODS.saturating_mul(period_ns));
+        while !terminated.load(Ordering::Relaxed) {
+            self.exchange(monotonic_ns(), |_| {})?;
+            if self.pace.as_ref().is_some_and(|pace| pace.state() == PaceState::Locked) {
+                return Ok(true);
+            }
+            let (waited_ns, frames) = (raw_ns() - began_ns, self.pace.as_ref().map_or(0, |pace| pace.frames()));
+            if waited_ns > if frames > 0 { PACE_LOADED * limit_ns } else { limit_ns } {
+                let (line, waited_s) = (self.line.address().to_string(), waited_ns as f64 / 1e9);
+                return Err(DeviceError::NoPace { line, tick_hz: 1e9 / period_ns as f64, frames, waited_s });
+            }
+            sleep_until(monotonic_ns() + LOOK_PACE_NS);
+        }
+        Ok(false)
+    }
+
+    /// Sets the time grid of the ticks. Takes the frames that have arrived during the start.
+    ///
+    /// # Errors
+    /// [`DeviceError`].
+    pub(super) fn start(&mut self, grid: Grid, now_ns: u64) -> Result<(), DeviceError> {
+        if self.pace.is_none() {
+            return Ok(());
+        }
+        for _ in 0..DRAIN_TURNS {
+            self.exchange(now_ns, |_| {})?;
+        }
+        if let Some(pace) = &mut self.pace {
+            pace.start(grid);
+        }
+        Ok(())
+    }
+
+    /// Returns true if the device gets no commands, because it was lost and the grid does not follow it again yet.
+    pub(super) fn withholds_commands(&self) -> bool {
+        self.pace.as_ref().is_some_and(|pace| pace.withholds())
+    }
+
+    /// Returns the relation of the grid to the device, if that sets the pace.
+    pub fn pace(&self) -> Option<PaceReport> {
+        self.pace.as_ref().map(|pace| pace.report(self.host.slips()))
     }
 
     /// Returns the names of the roles, separated by spaces.
@@ -279,8 +350,11 @@ impl DeviceLink {
         if !self.line.is_open() && !self.open_again(now_ns) {
             return Ok(());
         }
-        self.take_in(now_ns, &mut answer)?;
+        let drained = self.take_in(now_ns, &mut answer)?;
         let Self { line, host, greeting, .. } = self;
+        if let Some(pace) = &mut self.pace {
+            pace.look(raw_ns(), drained, host.slips(), host.restarts())?;
+        }
         let hello = greeting.hello();
         while let Some(frame) = host.due(now_ns, &hello) {
             if !line.write(frame) {
@@ -294,11 +368,13 @@ impl DeviceLink {
         Ok(())
     }
 
-    fn take_in(&mut self, now_ns: u64, answer: &mut impl FnMut(&Answer<'_>)) -> Result<(), DeviceError> {
+    /// Takes received bytes; returns true if no more are left.
+    fn take_in(&mut self, now_ns: u64, answer: &mut impl FnMut(&Answer<'_>)) -> Result<bool, DeviceError> {
         let mut bytes = [0; CHUNK];
-        let Self { line, host, greeting, device, other_device, absences, .. } = self;
+        let Self { line, host, greeting, device, other_device, absences, pace, .. } = self;
         for _ in 0..CHUNKS {
             let count = line.read(&mut bytes);
+            let arrived_ns = if pace.is_some() && count > 0 { line.arrived_ns() } else { 0 };
             for &byte in &bytes[..count] {
                 match host.push(byte, now_ns) {
                     None => {}
@@ -316,12 +392,17 @@ impl DeviceLink {
                         absences.greeted(welcome.next_tick, renamed.then_some(device.as_deref()).flatten());
                     }
                 }
+                if let Some(pace) = pace.as_deref_mut()
+                    && let Some(cycle) = host.take_cycle()
+                {
+                    pace.arrived(cycle, arrived_ns);
+                }
             }
             if count == 0 || line.is_stream() && count < CHUNK {
-                break;
+                return Ok(true);
             }
         }
-        Ok(())
+        Ok(false)
     }
 
     /// Tries at intervals to open the line; returns true if it is open.

@@ -102,6 +102,51 @@ pub enum DeviceError {
         /// Number of samples in the longer message.
         samples: usize,
     },
+    /// The run has no clock that a device may set.
+    #[error(
+        "no device can set the pace of this run: {reason}; run in real time with --external BODY, or leave out --pace device"
+    )]
+    #[strum(serialize = "no-pace-clock")]
+    PaceUnavailable {
+        /// The reason.
+        reason: String,
+    },
+    /// Another device sets the pace.
+    #[error("another device sets the pace of this run already; leave out --pace device")]
+    #[strum(serialize = "pace-taken")]
+    PaceTaken,
+    /// The device is not a body.
+    #[error("`{role}` cannot set the pace; only a driven body can, so leave out --pace device")]
+    #[strum(serialize = "pace-role")]
+    PaceRole {
+        /// The role.
+        role: String,
+    },
+    /// The device sends no frames by its own timer, or not at the run's rate.
+    #[error(
+        "the device on {line} keeps no pace of {tick_hz} Hz: {frames} frames came by its own timer in {waited_s:.1} s; give it a program \
+         that sends a frame in each of its cycles, set tick_hz to its rate, or leave out --pace device"
+    )]
+    #[strum(serialize = "no-pace")]
+    NoPace {
+        /// The line.
+        line: String,
+        /// The run's rate, Hz.
+        tick_hz: f64,
+        /// Received frames.
+        frames: u64,
+        /// Waiting time, s.
+        waited_s: f64,
+    },
+    /// The device that sets the pace is lost, and the run shall end then.
+    #[error(
+        "the device sets the pace, and was silent for {silent_s:.1} s; check its line, or give a longer --holdover"
+    )]
+    #[strum(serialize = "pace-lost")]
+    PaceLost {
+        /// The silence, s.
+        silent_s: f64,
+    },
     /// The device refuses the role.
     #[error("the device on {line} refuses to be `{role}`: {reason}")]
     #[strum(serialize = "device-refused")]

@@ -3,6 +3,7 @@
 //!
 //! Must not know the meaning of its bytes, nor decide how long to wait for a line that is gone.
 
+use crate::clock::raw_ns;
 use crate::serial::MAX_FRAME;
 use rustix::fd::OwnedFd;
 use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
@@ -10,12 +11,16 @@ use rustix::io::Errno;
 use rustix::termios::{
     ControlModes, OptionalActions, QueueSelector, SpecialCodeIndex, isatty, tcflush, tcgetattr, tcsetattr,
 };
+use rustix::time::{ClockId, Timespec, clock_gettime};
 use std::ffi::CString;
 use std::fmt;
 use std::io;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
+
+/// The largest age of a datagram's stamp, ns: an older one is from before the system's clock was set.
+const AGE_MAX_NS: u64 = 10_000_000_000;
 
 /// A line could not be opened.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
@@ -181,6 +186,15 @@ impl Line {
         }
     }
 
+    /// Returns the time at which the bytes that were read last arrived, on this host's monotonic clock, ns: of a datagram
+    /// that of its arrival in the system, of a stream the present.
+    pub fn arrived_ns(&self) -> u64 {
+        let now_ns = raw_ns();
+        let Some(socket) = self.port.as_ref().filter(|_| !self.is_stream()) else { return now_ns };
+        let age_ns = stamp(socket).and_then(|stamp_ns| realtime_ns().checked_sub(stamp_ns));
+        now_ns - age_ns.filter(|age_ns| *age_ns < AGE_MAX_NS).unwrap_or(0)
+    }
+
     /// Sends a frame after what is left of the previous one. Returns false if the rest of the previous frame was
     /// dropped.
     pub fn write(&mut self, frame: &[u8]) -> bool {
@@ -214,6 +228,27 @@ impl Line {
         self.port = None;
         (self.from, self.to) = (0, 0);
     }
+}
+
+/// Returns the time at which the last datagram arrived, on the system's realtime clock, ns. The first call switches the
+/// stamps on.
+#[allow(unsafe_code)]
+fn stamp(socket: &OwnedFd) -> Option<u64> {
+    /// SIOCGSTAMPNS of the kernel.
+    const GET_STAMP: rustix::ioctl::Opcode = 0x8907;
+    // SAFETY: this request writes a timespec of the native width, the layout of `Timespec` on systems with 64 bits, and
+    // nothing else.
+    let stamp = unsafe { rustix::ioctl::ioctl(socket, rustix::ioctl::Getter::<GET_STAMP, Timespec>::new()) };
+    stamp.ok().map(nanoseconds)
+}
+
+/// Returns the time on the system's realtime clock, ns.
+fn realtime_ns() -> u64 {
+    nanoseconds(clock_gettime(ClockId::Realtime))
+}
+
+fn nanoseconds(time: Timespec) -> u64 {
+    time.tv_sec as u64 * 1_000_000_000 + time.tv_nsec as u64
 }
 
 fn refused(path: &Path, error: Errno) -> LineError {
@@ -364,6 +399,19 @@ mod tests {
                 far.send_to(&frame[..length], host).unwrap();
             }
             assert_eq!([read(&mut line, &mut bytes), read(&mut line, &mut bytes)], [3, 5]);
+            // Stamped when it arrives, whenever it is read. The system begins to stamp a moment after the first question.
+            loop {
+                let before_ns = raw_ns();
+                far.send_to(&frame, host).unwrap();
+                std::thread::sleep(std::time::Duration::from_millis(20));
+                assert_eq!(read(&mut line, &mut bytes), MAX_FRAME);
+                let (arrived_ns, read_ns) = (line.arrived_ns(), raw_ns());
+                assert!(arrived_ns + 1_000_000 > before_ns && arrived_ns <= read_ns, "{before_ns} {arrived_ns}");
+                assert!(std::time::Instant::now() < end, "no stamp came");
+                if arrived_ns + 15_000_000 < read_ns {
+                    break;
+                }
+            }
             // Not from another address.
             UdpSocket::bind(own).unwrap().send_to(&frame, host).unwrap();
             far.send_to(&frame[..4], host).unwrap();

@@ -15,6 +15,7 @@ mod late_watch;
 mod line;
 mod link;
 mod node;
+mod pace;
 mod privileges;
 mod role_function;
 mod role_id;
@@ -41,6 +42,7 @@ pub use node::{
     Node, Poll, Ports, ReadyNode, RunCondition, build_rig, ports, private_ledger, report, shared_ledger, topic,
 };
 pub use node::{accepted_ticks, late_log, ledger_file, ledger_words, next_tick, shared_memory_bytes};
+pub use pace::{OnLost, Pace, PaceBoard, PaceOptions, PaceState, PaceStatus};
 #[cfg(feature = "hosts")]
 pub use privileges::take_priority_above_roles;
 pub use privileges::{Privileges, hold_low_latency_idle, priority_remedy, refused_priority, unavailable_cores};

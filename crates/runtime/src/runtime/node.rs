@@ -131,6 +131,7 @@ pub fn report(
         grants,
         line: None,
         outages: Vec::new(),
+        pace: None,
         late_inputs: 0,
         late_ticks: late_log(scenario, role, ledger).map_or_else(Vec::new, |log| log.records(0).collect()),
     }

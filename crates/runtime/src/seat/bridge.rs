@@ -4,9 +4,9 @@ use super::process::{
     RoleError, device_failure_path, failure_path, find_role, in_domain, join, require_process, take_ledger, write_whole,
 };
 use crate::config::{ClockKind, Settings};
-use crate::runtime::{DeviceConfig, DeviceLink, NodeError, RoleId, RoleImpl};
+use crate::runtime::{DeviceConfig, DeviceError, DeviceLink, NodeError, Pace, RoleId, RoleImpl};
 use crate::serial::LineCounters;
-use crate::telemetry::Outage;
+use crate::telemetry::{Outage, PaceReport};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
@@ -17,6 +17,8 @@ pub struct BridgeResult {
     pub counters: LineCounters,
     /// The outages of the device.
     pub outages: Vec<Outage>,
+    /// The relation of the run's clock to the device, if that sets the pace.
+    pub pace: Option<PaceReport>,
     /// Reason if the device was lost: at the end of the run, or in real time for longer than the command timeout.
     pub lost: Option<String>,
 }
@@ -66,6 +68,14 @@ pub fn run_bridge(
     let known = device_path(domain.root(), link.role());
     let before = std::fs::read_to_string(&known).ok();
     let Some(name) = link.greet(before, terminated)? else { return Ok(None) };
+    if let Some(options) = config.pace {
+        if !matches!(roles[..], [RoleId::Plant(_)]) {
+            return Err(DeviceError::PaceRole { role: link.role().to_owned() }.into());
+        }
+        if !link.follow(Pace::open(&domain, &scenario, options)?, terminated)? {
+            return Ok(None);
+        }
+    }
     welcomed(&format!("{name}{}", link.remark()));
     write_whole(&known, name.as_bytes()).map_err(|source| RoleError::Report { path: known.clone(), source })?;
     let (last, companions) = roles.split_last().expect("a device has a role");
@@ -75,13 +85,14 @@ pub fn run_bridge(
     let done = in_domain(&domain, &scenario, role_impl, terminated, |report| {
         if let Some(counters) = report.line {
             let lost = report.outages.iter().rev().find_map(|outage| lost(outage, &scenario));
-            served = Some(BridgeResult { counters, outages: report.outages.clone(), lost });
+            served = Some(BridgeResult { counters, outages: report.outages.clone(), pace: report.pace.clone(), lost });
         }
     });
     if let Err(RoleError::Node(NodeError::Device(error))) = &done {
         // For the launcher, which has no other connection to this process. The caller gets the error in any case.
         for role in &roles {
-            let path = if scenario.clock == ClockKind::Realtime { device_failure_path } else { failure_path };
+            let ends = scenario.clock != ClockKind::Realtime || matches!(error, DeviceError::PaceLost { .. });
+            let path = if ends { failure_path } else { device_failure_path };
             let _ = write_whole(&path(domain.root(), role.name(&scenario)), error.to_string().as_bytes());
         }
     }

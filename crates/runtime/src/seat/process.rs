@@ -6,7 +6,7 @@ use crate::bus::domain::{Domain, DomainError, domains};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::changes::ReceivedChanges;
-use crate::clock::{self, Grid, monotonic_ns, sleep_until};
+use crate::clock::{self, Grid, RunClock, monotonic_ns, sleep_until};
 use crate::config::{ClockKind, ConfigError, Realtime, Settings, Wake};
 use crate::files;
 use crate::panics;
@@ -160,7 +160,7 @@ pub enum RoleError {
     )]
     #[strum(serialize = "run-ended")]
     Late,
-    /// The run was launched on another host, and its clock cannot be read.
+    /// The run has a clock of its own, which cannot be read.
     #[error("cannot read the clock of the run in {}: {source}; {}", path.display(), remedy(source))]
     #[strum(serialize = "no-run-clock")]
     Clock {
@@ -336,6 +336,7 @@ pub fn clock_path(domain: &Domain) -> PathBuf {
 pub fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
     let domain = Domain::join(directory)?;
     let path = clock_path(&domain);
+    let path = if path.exists() { path } else { domain.shared(RunClock::PACE) };
     clock::adopt(&path).map_err(|source| RoleError::Clock { path, source })?;
     let scenario = Scenario::load(&scenario_path(&domain), &[])?;
     let path = changes_path(&domain);
@@ -501,8 +502,8 @@ pub fn serve<B: Bus + 'static>(
         let grants = if *member == role { privileges.grants.clone() } else { Vec::new() };
         let node = node.member(*member).unwrap_or(&*node);
         stages.extend(node.stages());
-        let (line, outages, late_inputs) = (node.line(), node.outages(), node.late_inputs());
-        deliver(&RoleReport { line, outages, late_inputs, ..report(scenario, *member, ledger, stages, grants) })?;
+        let (line, outages, pace, late_inputs) = (node.line(), node.outages(), node.pace(), node.late_inputs());
+        deliver(&RoleReport { line, outages, pace, late_inputs, ..report(scenario, *member, ledger, stages, grants) })?;
     }
     // Samples may still wait in queues: the links stay open until all readers are done.
     if ended == Ended::Finished {

@@ -27,4 +27,6 @@ pub use latency::{Latency, MAX_LATENCY_NS, Percentiles, Tallies};
 pub use latency::{quantile, sorted};
 pub use ledger::{Ledger, LedgerError, Slots, Store};
 pub use machine::MachineInfo;
-pub use report::{Grant, LinkRead, LinkWritten, Outage, RoleReport, StageReport, Ticks, WatchReport, WatchedReport};
+pub use report::{
+    Grant, LinkRead, LinkWritten, Outage, PaceReport, RoleReport, StageReport, Ticks, WatchReport, WatchedReport,
+};

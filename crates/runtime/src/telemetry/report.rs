@@ -30,6 +30,9 @@ pub struct RoleReport {
     /// The times in which that device was absent.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub outages: Vec<Outage>,
+    /// The relation of the run's clock to that device, if the device sets the pace.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pace: Option<PaceReport>,
     /// The number of changes of inputs that it applied after their tick, because it received them too late.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub late_inputs: u64,
@@ -56,6 +59,46 @@ pub struct Outage {
     pub code: String,
     /// The cause in words.
     pub cause: String,
+}
+
+/// The relation of a run's clock to the device that sets its pace.
+///
+/// The phase error of a window of a quarter second, or 16 periods if that is longer, is the delay of its least delayed
+/// frame against the grid.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct PaceReport {
+    /// The state at the end: `acquiring`, `locked`, `holdover` or `lost`.
+    pub state: String,
+    /// The time from the device's first frame until the grid was locked, s; absent if it never was.
+    pub locked_after_s: Option<f64>,
+    /// The longest time from the first frame after a silence until the grid was locked again, s.
+    pub relocked_after_s_max: Option<f64>,
+    /// The median phase error since the first lock, µs.
+    pub phase_error_p50_us: Option<f64>,
+    /// Its 99th percentile, µs.
+    pub phase_error_p99_us: Option<f64>,
+    /// Its maximum, µs.
+    pub phase_error_max_us: Option<f64>,
+    /// The device's clock against this host's, ppm: positive if it is faster.
+    pub drift_ppm: f64,
+    /// Cycles that the device executed without the request that was sent, or due, for them. Lost requests do not count.
+    pub slips: u64,
+    /// Received frames.
+    pub frames: u64,
+    /// The number of silences in which the grid ran on by itself, and their sum, s.
+    pub holdovers: u64,
+    /// See `holdovers`.
+    pub holdover_s: f64,
+    /// The number of silences beyond the holdover.
+    pub lost: u64,
+    /// The number of corrections of the clock after the first tick.
+    pub corrections: u64,
+    /// The largest error that one of them began to remove, µs.
+    pub largest_correction_us: f64,
+    /// The steepest rate at which the clock was corrected, ppm.
+    pub steepest_ppm: f64,
+    /// The course, every second: time since the first frame, s; correction since the first tick, µs; phase error, µs.
+    pub track: Vec<[f64; 3]>,
 }
 
 /// The results of a watchdog.

@@ -18,7 +18,9 @@ use crate::runtime::role_id::RoleId;
 use crate::sample::{Message, Sample, Stamp, content_length, copy_fields};
 use crate::serial::{Answer, LineCounters, Samples};
 use crate::state::{Persist, Words};
-use crate::telemetry::{LateRecord, LateTicks, Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
+use crate::telemetry::{
+    LateRecord, LateTicks, Latency, Ledger, LedgerError, Outage, PaceReport, StageReport, TickCounters, Ticks,
+};
 
 /// A device with its links and counters.
 pub struct BridgeNode<R: Rig, B: Bus> {
@@ -120,7 +122,8 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
     fn ask(&mut self, now_ns: u64) -> Result<(), NodeError> {
         let tick = self.counters.next();
         let found = tick > 0 && self.command.seek(tick - 1)? == Seek::Found;
-        let command = self.command.sample().filter(|_| found);
+        // A device that was lost applies its safe command until the grid follows it again.
+        let command = self.command.sample().filter(|_| found && !self.link.withholds_commands());
         self.command_origin_ns = command.map(|command| command.stamp().origin_ns);
         let samples = command.map_or(Samples::default(), |command| Samples { present: 1, bytes: command.content() });
         self.link.request(tick, samples, now_ns);
@@ -246,6 +249,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
         if self.clock == Clock::Monotonic {
             self.command.expect(AcceptedTicks::Due(grid));
         }
+        self.link.start(grid, monotonic_ns())?;
         self.measurement.dispatch()?;
         self.measurement.finish()?;
         self.truth.dispatch()?;
@@ -359,6 +363,10 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
 
     fn outages(&self) -> Vec<Outage> {
         self.link.outages()
+    }
+
+    fn pace(&self) -> Option<PaceReport> {
+        self.link.pace()
     }
 }
 

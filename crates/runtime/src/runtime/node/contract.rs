@@ -4,7 +4,7 @@ use crate::clock::Grid;
 use crate::runtime::error::NodeError;
 use crate::runtime::role_id::RoleId;
 use crate::serial::LineCounters;
-use crate::telemetry::{LateTicks, LedgerError, Outage, StageReport, Ticks};
+use crate::telemetry::{LateTicks, LedgerError, Outage, PaceReport, StageReport, Ticks};
 
 /// Condition under which a node executes its next tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -108,6 +108,10 @@ pub trait Node {
     }
     /// Returns the counters of its device's serial line, if it has one.
     fn line(&self) -> Option<LineCounters> {
+        None
+    }
+    /// Returns the relation of the grid to its device, if that sets the pace.
+    fn pace(&self) -> Option<PaceReport> {
         None
     }
     /// Returns the number of changes of inputs that acted after their tick.
