@@ -100,6 +100,26 @@ impl InputServer {
         }
     }
 
+    /// Applies the safe command of every driven body as soon as possible. Returns the tick from which it acts.
+    ///
+    /// # Errors
+    /// The reason.
+    pub fn go_safe(
+        &mut self,
+        scenario: &Settings,
+        list: &ReceivedChanges,
+        timing: &dyn Fn() -> Timing,
+        ignores: &dyn Fn(RoleId) -> bool,
+    ) -> Result<u64, String> {
+        let safe = WantedChange { key: "actuator.safe".to_owned(), value: toml::Value::Boolean(true), ramp_s: 0.0 };
+        match self.set(scenario, list, timing, ignores, &[safe], None) {
+            Ok(Answer::Accepted { tick, .. }) => Ok(tick),
+            Ok(_) => Err("the launcher did not accept it".to_owned()),
+            Err(Answer::Refused { reason, .. }) => Err(reason),
+            Err(_) => Err("the launcher refused it".to_owned()),
+        }
+    }
+
     /// Appends the pending changes up to a tick, before any role can come there.
     pub fn append_pending(&mut self, list: &ReceivedChanges, last_tick: u64) {
         if self.pending.is_empty() {

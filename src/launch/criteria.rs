@@ -372,8 +372,11 @@ impl Judge<'_> {
     /// Returns the roles' counts. A role without counters missed the ticks that its readers lack.
     fn roles(&self) -> Vec<Counted<'_>> {
         let booked = self.books.roles.iter().map(|(role, ticks)| {
-            let Ticks { elapsed, missed, starved, safe, late, .. } = *ticks;
-            let late = late.map(|late| missed + starved + late);
+            let Ticks { elapsed, excused, .. } = *ticks;
+            let [missed, starved, safe] =
+                [(ticks.missed, excused.missed), (ticks.starved, excused.starved), (ticks.safe, excused.safe)]
+                    .map(|(all, excused)| all.saturating_sub(excused));
+            let late = ticks.late.map(|late| missed + starved + late.saturating_sub(excused.late));
             Counted { role, elapsed, missed: Some(missed), starved: Some(starved), safe: Some(safe), late }
         });
         let elapsed = self.elapsed();

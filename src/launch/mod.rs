@@ -17,6 +17,7 @@ mod join;
 mod junit;
 mod options;
 mod outcome;
+mod overrun;
 mod processes;
 mod recorder;
 mod relay;

@@ -12,6 +12,7 @@ use super::external::{ExternalWatch, Waiting};
 use super::foxglove;
 use super::incident::{Action, Incident, Incidents, RoleFailure};
 use super::janitor::Janitor;
+use super::overrun::{Overran, OverrunWatch};
 use super::recorder::RecorderWatch;
 use super::relay::RelayWatch;
 use super::remains::Remains;
@@ -24,7 +25,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Signal, Write};
 use crate::changes::ReceivedChanges;
 use crate::clock::{self, Grid, RunClock, monotonic_ns};
-use crate::config::ClockKind;
+use crate::config::{ClockKind, Overrun};
 use crate::hosts::{NetworkStatistics, RELAY};
 use crate::input::Change;
 use crate::inputs::{InputServer, Timing};
@@ -303,6 +304,9 @@ pub(super) struct Supervisor<'a> {
     tracer: TracerWatch,
     /// Present if a device may set the pace.
     pace: Option<PaceBoard>,
+    overrun: OverrunWatch,
+    /// True while the safe command is to be applied after an overrun.
+    goes_safe: bool,
     /// Absent on a host that joined: the launching host receives the changes.
     inputs: Option<InputServer>,
     received: Arc<ReceivedChanges>,
@@ -361,6 +365,8 @@ impl<'a> Supervisor<'a> {
             relay,
             tracer,
             pace: None,
+            overrun: OverrunWatch::new(scenario),
+            goes_safe: false,
             inputs,
             received: scenario.inputs.received(),
         })
@@ -613,6 +619,12 @@ impl<'a> Supervisor<'a> {
         let ignores = |role: RoleId| takes_no_inputs(scenario, launch, domain, members, role);
         if let Some(inputs) = &mut self.inputs {
             inputs.poll(scenario, &self.received, &timing, &ignores);
+            if std::mem::take(&mut self.goes_safe) {
+                match inputs.go_safe(scenario, &self.received, &timing, &ignores) {
+                    Ok(tick) => tell(format_args!("corotate: the safe command of every body acts from tick {tick} on")),
+                    Err(reason) => tell(format_args!("corotate: the safe command cannot be applied: {reason}")),
+                }
+            }
         }
         self.changes.publish()
     }
@@ -633,6 +645,16 @@ impl<'a> Supervisor<'a> {
         for incident in self.relay.supervise(self.scenario, tick) {
             tell(format_args!("corotate: {}", self.incidents.add(incident, note)));
             go_on = false;
+        }
+        if let Some(Overran { role, tick, failure }) = self.overrun.look(self.scenario, &self.members) {
+            if self.overrun.policy() == Overrun::Stop {
+                let incident = Incident::new(role, tick, failure, Action::Stopped);
+                tell(format_args!("corotate: {}", self.incidents.add(incident, note)));
+                go_on = false;
+            } else {
+                tell(format_args!("corotate: {role}: {}", failure.cause));
+                self.goes_safe = true;
+            }
         }
         let ticks_ns = (self.scenario.last_tick + 1).saturating_mul(self.scenario.period_ns);
         let over = self.scenario.clock == ClockKind::Realtime && now_ns > self.word.epoch_ns.saturating_add(ticks_ns);

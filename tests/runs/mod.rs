@@ -15,6 +15,7 @@ mod inputs;
 mod late;
 mod one_plant;
 mod one_process;
+mod overrun;
 mod own_rig;
 mod pace;
 mod processes;

@@ -45,6 +45,8 @@ impl<'a> Supervisor<'a> {
             relay,
             tracer: TracerWatch::none()?,
             pace: None,
+            overrun: OverrunWatch::off(),
+            goes_safe: false,
             inputs: None,
             received: scenario.inputs.received(),
         })

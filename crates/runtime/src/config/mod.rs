@@ -31,7 +31,7 @@ pub use hosts::{ClockSource, Host, Hosts, LinkBudget, Network};
 pub(crate) use input::DISCONNECTED;
 pub use input::{ChangeLists, InputInfo, InputUse, InputUser, Inputs, ResponseField, Variability, set_point_of};
 pub use rates::Rates;
-pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Trace, Wake};
+pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Overrun, Policy, Realtime, Supervision, Trace, Wake};
 pub(crate) use reader::keys_of;
 pub use run_id::{NoRunId, RunId};
 pub use sensor::Sensor;

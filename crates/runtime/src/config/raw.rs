@@ -145,6 +145,35 @@ pub struct Realtime {
     pub late_us: Option<f64>,
     /// The source of the causes of late ticks.
     pub trace: Trace,
+    /// The reaction to a role that misses a tick without a scripted fault.
+    #[serde(skip_serializing_if = "Overrun::is_skip")]
+    pub overrun: Overrun,
+    /// The number of first ticks in which nothing is judged: neither missed, starved, late and safe ticks nor latencies.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub start_grace_ticks: u64,
+}
+
+fn is_zero(number: &u64) -> bool {
+    *number == 0
+}
+
+/// The reaction to a role that misses a tick without a scripted fault.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Overrun {
+    /// Counts the tick, and goes on with the next one that is due.
+    #[default]
+    Skip,
+    /// Ends the run in order.
+    Stop,
+    /// Applies the safe command of every driven body.
+    Safe,
+}
+
+impl Overrun {
+    fn is_skip(&self) -> bool {
+        *self == Self::Skip
+    }
 }
 
 /// The source of the causes of late ticks.
@@ -182,6 +211,8 @@ impl Default for Realtime {
             cutoff: 0.75,
             late_us: None,
             trace: Trace::Auto,
+            overrun: Overrun::Skip,
+            start_grace_ticks: 0,
         }
     }
 }

@@ -152,18 +152,35 @@ pub struct Driver<'a, 'b, B: Bus> {
     gap: SpinGap,
     /// True if the process slept until a time before the current tick, and was not seen awake before its inputs.
     slept: bool,
+    /// The tick before which latencies are not judged, until it has come.
+    grace_ticks: u64,
 }
 
 impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
     /// Creates a driver up to `last_tick`; in lockstep at most `window_ticks` ahead of the slowest consumer.
     pub fn new(launcher: &'a mut LauncherLink<'b, B>, last_tick: u64, window_ticks: u64) -> Self {
-        Self { launcher, last_tick, window_ticks, next_turn_ns: 0, late: None, gap: SpinGap::default(), slept: false }
+        Self {
+            launcher,
+            last_tick,
+            window_ticks,
+            next_turn_ns: 0,
+            late: None,
+            gap: SpinGap::default(),
+            slept: false,
+            grace_ticks: 0,
+        }
     }
 
     /// Adds the records of late ticks.
     #[must_use]
     pub fn with_late(self, late: Option<LateWatch>) -> Self {
         Self { late, ..self }
+    }
+
+    /// Forgets the latencies of the ticks before `grace_ticks`.
+    #[must_use]
+    pub fn with_grace(self, grace_ticks: u64) -> Self {
+        Self { grace_ticks, ..self }
     }
 
     /// Drives a node on the time grid.
@@ -193,6 +210,10 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
                 }
                 Some(Poll::Waiting | Poll::Missed) => {}
                 None => return Ok(Ended::Stopped),
+            }
+            if self.grace_ticks > 0 && node.next_tick() >= self.grace_ticks {
+                node.clear_stages();
+                self.grace_ticks = 0;
             }
             if let Some(late) = &mut self.late {
                 late.look(node, grid, &self.gap, self.slept);

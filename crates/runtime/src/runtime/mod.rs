@@ -41,7 +41,7 @@ pub use node::retained_samples;
 pub use node::{
     Node, Poll, Ports, ReadyNode, RunCondition, build_rig, ports, private_ledger, report, shared_ledger, topic,
 };
-pub use node::{accepted_ticks, late_log, ledger_file, ledger_words, next_tick, shared_memory_bytes};
+pub use node::{accepted_ticks, committed_ticks, late_log, ledger_file, ledger_words, next_tick, shared_memory_bytes};
 pub use pace::{OnLost, Pace, PaceBoard, PaceOptions, PaceState, PaceStatus};
 #[cfg(feature = "hosts")]
 pub use privileges::take_priority_above_roles;

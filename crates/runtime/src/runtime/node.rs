@@ -35,7 +35,9 @@ use crate::config::{ClockKind, Settings};
 use crate::control::Watchdog;
 use crate::rig::{Fleet, Rig, sensed_body};
 use crate::state::{Persist, StoredWords};
-use crate::telemetry::{Grant, Ledger, LedgerError, ReadCounters, RoleReport, StageReport, TickCounters, WatchReport};
+use crate::telemetry::{
+    Grant, Ledger, LedgerError, ReadCounters, RoleReport, StageReport, TickCounters, Ticks, WatchReport,
+};
 use context::{extent, words};
 use plant::PlantNode;
 use std::path::Path;
@@ -90,6 +92,14 @@ pub fn shared_memory_bytes(scenario: &Settings) -> usize {
         + port(&input)
         + port(&health)
         + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
+}
+
+/// Returns the ticks that a role has committed.
+pub fn committed_ticks(ledger: &Ledger) -> Ticks {
+    let record = ledger.record().unwrap_or_default();
+    let mut ticks = TickCounters::default();
+    ticks.persist(&mut StoredWords(&record));
+    ticks.report()
 }
 
 /// Returns the report of a role: the counters in its ledger, with the stages and grants that the role adds.

@@ -630,7 +630,10 @@ fn drive<B: Bus>(
     let succeeds = scenario.clock == ClockKind::Realtime && !launcher.first();
     let first_tick = if succeeds { grid.next_at(monotonic_ns()) } else { node.next_tick() };
     node.start(grid, first_tick.min(scenario.last_tick + 1))?;
-    let mut driver = Driver::new(launcher, scenario.last_tick, window_ticks(scenario)).with_late(late);
+    let driver = Driver::new(launcher, scenario.last_tick, window_ticks(scenario)).with_late(late);
+    // A successor begins after them.
+    let grace_ticks = scenario.realtime.start_grace_ticks;
+    let mut driver = driver.with_grace(if first_tick < grace_ticks { grace_ticks } else { 0 });
     let ended = match scenario.clock {
         ClockKind::Realtime => driver.realtime(&mut **node, grid, policy),
         ClockKind::Lockstep | ClockKind::InProcess => driver.lockstep(&mut **node),

@@ -3,7 +3,7 @@
 //! Nodes and links decide which counter an event belongs to; this module only adds.
 
 use super::ledger::Ledger;
-use super::{LateRecord, LateTicks, LinkRead, LinkWritten, StateHash, Ticks, WatchReport, WatchedReport};
+use super::{Excused, LateRecord, LateTicks, LinkRead, LinkWritten, StateHash, Ticks, WatchReport, WatchedReport};
 use crate::control::{Breaches, Watchdog};
 use crate::role::Refusal;
 use crate::state::persist_fields;
@@ -21,15 +21,37 @@ pub struct TickCounters {
     scripted: u64,
     anew: u64,
     first_disturbed: Option<u64>,
+    /// Of these, ticks before `grace_ticks`.
+    excused: Excused,
+    grace_ticks: u64,
     /// Late ticks of this process.
     late_ticks: LateTicks,
     /// True if a scripted fault stalled the role before the current tick.
     just_stalled: bool,
 }
 
-persist_fields!(TickCounters, next, executed, missed, starved, late, safe, stalled, scripted, anew, first_disturbed);
+persist_fields!(
+    TickCounters,
+    next,
+    executed,
+    missed,
+    starved,
+    late,
+    safe,
+    stalled,
+    scripted,
+    anew,
+    first_disturbed,
+    excused
+);
+persist_fields!(Excused, missed, scripted, starved, late, safe);
 
 impl TickCounters {
+    /// Creates counters that are zero; ticks before `grace_ticks` are excused.
+    pub fn new(grace_ticks: u64) -> Self {
+        Self { grace_ticks, ..Self::default() }
+    }
+
     /// The next tick to execute.
     #[inline]
     pub fn next(&self) -> u64 {
@@ -43,6 +65,7 @@ impl TickCounters {
         if missed > 0 {
             self.disturbed(self.next);
             self.missed += missed;
+            self.excused.missed += tick.min(self.grace_ticks).saturating_sub(self.next);
             self.next = tick;
             self.late_ticks.missed += missed;
             self.late_ticks.missed_end = tick;
@@ -63,6 +86,7 @@ impl TickCounters {
     #[inline]
     pub fn starved(&mut self, tick: u64, sender: u64) {
         self.starved += 1;
+        self.excused.starved += u64::from(tick < self.grace_ticks);
         self.disturbed(tick);
         self.enter_late(LateRecord { tick, sender, starved: true, ..LateRecord::default() });
     }
@@ -71,6 +95,7 @@ impl TickCounters {
     #[inline]
     pub fn late(&mut self, record: LateRecord) {
         self.late += 1;
+        self.excused.late += u64::from(record.tick < self.grace_ticks);
         self.enter_late(record);
     }
 
@@ -89,6 +114,7 @@ impl TickCounters {
     #[inline]
     pub fn safe(&mut self) {
         self.safe += 1;
+        self.excused.safe += u64::from(self.next < self.grace_ticks);
     }
 
     /// Counts the scripted stalls before a tick.
@@ -101,6 +127,7 @@ impl TickCounters {
     /// Counts the next tick as missed: an input is missing, or, if `scripted`, a scripted fault takes the tick.
     pub fn pass(&mut self, scripted: bool) {
         self.scripted += u64::from(scripted);
+        self.excused.scripted += u64::from(scripted && self.next < self.grace_ticks);
         self.skip_to(self.next + 1);
         // A tick that a fault takes has no other cause.
         self.late_ticks.missed -= u64::from(scripted);
@@ -130,6 +157,7 @@ impl TickCounters {
             scripted: self.scripted,
             anew: self.anew,
             first_disturbed: self.first_disturbed,
+            excused: self.excused,
         }
     }
 }

@@ -129,6 +129,12 @@ impl Latency {
         self.tallies.ahead_max_ns = self.tallies.ahead_max_ns.max(counted.tallies.ahead_max_ns);
     }
 
+    /// Forgets all counts.
+    pub fn clear(&mut self) {
+        self.histogram.clear();
+        self.tallies = Tallies::default();
+    }
+
     /// Returns true if nothing was counted, including negative differences.
     pub fn is_empty(&self) -> bool {
         self.histogram.is_empty() && self.tallies.ahead == 0

@@ -28,5 +28,6 @@ pub use latency::{quantile, sorted};
 pub use ledger::{Ledger, LedgerError, Slots, Store};
 pub use machine::MachineInfo;
 pub use report::{
-    Grant, LinkRead, LinkWritten, Outage, PaceReport, RoleReport, StageReport, Ticks, WatchReport, WatchedReport,
+    Excused, Grant, LinkRead, LinkWritten, Outage, PaceReport, RoleReport, StageReport, Ticks, WatchReport,
+    WatchedReport,
 };

@@ -157,6 +157,38 @@ pub struct Ticks {
     pub anew: u64,
     /// The first tick whose result may differ from an undisturbed run's.
     pub first_disturbed: Option<u64>,
+    /// Of these, ticks within `realtime.start_grace_ticks`, which are not judged.
+    #[serde(default, skip_serializing_if = "Excused::is_none")]
+    pub excused: Excused,
+}
+
+/// Counted ticks that are not judged, because they are among the first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Excused {
+    /// Missed ticks.
+    pub missed: u64,
+    /// Of these, ticks that a scripted fault took.
+    pub scripted: u64,
+    /// Ticks at which a due input was absent.
+    pub starved: u64,
+    /// Late ticks.
+    pub late: u64,
+    /// Ticks at which a plant applied its safe command.
+    pub safe: u64,
+}
+
+impl Excused {
+    fn is_none(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
+impl Ticks {
+    /// Returns the number of ticks that were missed after the start without a scripted fault.
+    pub fn overruns(&self) -> u64 {
+        let excused = self.excused.missed.saturating_sub(self.excused.scripted);
+        self.missed.saturating_sub(self.scripted).saturating_sub(excused)
+    }
 }
 
 /// The counters of a signal's writing end: `published` + `void` + `skipped` = `last_tick` + 1.

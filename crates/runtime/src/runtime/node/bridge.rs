@@ -83,7 +83,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             clock: context.clock,
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
             last_tick: scenario.last_tick,
-            counters: TickCounters::default(),
+            counters: TickCounters::new(context.scenario.realtime.start_grace_ticks),
             interruptions: context.interruptions(),
             ledger: context.ledger.reopened(),
             asked: false,
@@ -355,6 +355,10 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
 
     fn stages(&self) -> Vec<StageReport> {
         StageReport::all(&[("lateness", &self.lateness), ("serial", &self.serial), ("age", &self.age)])
+    }
+
+    fn clear_stages(&mut self) {
+        [&mut self.lateness, &mut self.serial, &mut self.age].into_iter().for_each(Latency::clear);
     }
 
     fn line(&self) -> Option<LineCounters> {

@@ -98,6 +98,8 @@ pub trait Node {
     fn late_ticks(&self) -> Option<&LateTicks>;
     /// Returns the latencies.
     fn stages(&self) -> Vec<StageReport>;
+    /// Forgets the latencies so far.
+    fn clear_stages(&mut self);
     /// Returns the length of the node's state, words.
     fn state_words(&mut self) -> usize;
     /// Passes every number of the role's own state, in an order that does not change: not the counters, nor the state of its links.

@@ -20,7 +20,7 @@ use crate::runtime::sample_source::{Progress, SampleSource};
 use crate::sample::Message;
 use crate::serial::LineCounters;
 use crate::state::{Persist, Words};
-use crate::telemetry::{LateTicks, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
+use crate::telemetry::{LateTicks, Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
 
 /// A controller with its links and counters.
 pub struct ControllerNode<R: Rig, B: Bus> {
@@ -64,7 +64,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             estimate,
             channels: Channels { single, fleets },
             clock: context.clock,
-            counters: TickCounters::default(),
+            counters: TickCounters::new(context.scenario.realtime.start_grace_ticks),
             watchdog: Watchdog::new(context.scenario.watch),
             interruptions: context.interruptions(),
             inputs: context.inputs(|user| matches!(user, InputUser::Law(_) | InputUser::Reference)),
@@ -397,6 +397,11 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     #[inline]
     fn late_ticks(&self) -> Option<&LateTicks> {
         Some(self.counters.late_ticks())
+    }
+
+    fn clear_stages(&mut self) {
+        let Stages { hop, step, age, .. } = &mut self.stages;
+        [hop, step, age].into_iter().for_each(Latency::clear);
     }
 
     fn stages(&self) -> Vec<StageReport> {

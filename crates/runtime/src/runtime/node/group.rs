@@ -220,6 +220,10 @@ impl Node for GroupNode {
         self.members.last().and_then(|member| member.node.late_ticks())
     }
 
+    fn clear_stages(&mut self) {
+        self.members.iter_mut().for_each(|member| member.node.clear_stages());
+    }
+
     fn stages(&self) -> Vec<StageReport> {
         self.members.last().map_or_else(Vec::new, |member| member.node.stages())
     }

@@ -63,7 +63,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
             estimate,
             held: Held::new(context.scenario.rates.observer_ticks, 1),
             clock: context.clock,
-            counters: TickCounters::default(),
+            counters: TickCounters::new(context.scenario.realtime.start_grace_ticks),
             interruptions: context.interruptions(),
             inputs: context.inputs(|user| user == InputUser::Observer),
             ledger: context.ledger.reopened(),
@@ -292,6 +292,10 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     #[inline]
     fn late_ticks(&self) -> Option<&LateTicks> {
         Some(self.counters.late_ticks())
+    }
+
+    fn clear_stages(&mut self) {
+        [&mut self.hop, &mut self.step, &mut self.age].into_iter().for_each(Latency::clear);
     }
 
     fn stages(&self) -> Vec<StageReport> {

@@ -84,7 +84,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             clock: context.clock,
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
             last_tick: scenario.last_tick,
-            counters: TickCounters::default(),
+            counters: TickCounters::new(context.scenario.realtime.start_grace_ticks),
             interruptions: context.interruptions(),
             inputs: match context.role {
                 RoleId::Plant(index) => {
@@ -447,6 +447,10 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P
     #[inline]
     fn late_ticks(&self) -> Option<&LateTicks> {
         Some(self.counters.late_ticks())
+    }
+
+    fn clear_stages(&mut self) {
+        [&mut self.lateness, &mut self.age, &mut self.step].into_iter().for_each(Latency::clear);
     }
 
     fn stages(&self) -> Vec<StageReport> {
