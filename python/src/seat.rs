@@ -59,7 +59,8 @@ fn blank(outputs: &[Vec<u64>]) -> Vec<Vec<u8>> {
     outputs.iter().map(|words| words.iter().flat_map(|word| word.to_ne_bytes()).collect()).collect()
 }
 
-/// Serves a seat to the end of the run with a function of tick, inputs and blank outputs, all as bytes, that returns the outputs.
+/// Serves a seat to the end of the run with a function of tick, inputs, values and blank outputs, which returns the outputs. Samples are
+/// bytes.
 /// Raises the function's own exception.
 #[pyfunction]
 pub fn serve(py: Python<'_>, domain: PathBuf, role: String, function: Py<PyAny>) -> PyResult<()> {
@@ -81,7 +82,7 @@ impl RoleFunction for Function {
             let bytes = |bytes: Vec<u8>| PyBytes::new(py, &bytes).unbind();
             let given: Vec<Option<Py<PyBytes>>> = inputs(&tick).into_iter().map(|input| input.map(bytes)).collect();
             let blank: Vec<Py<PyBytes>> = blank(tick.outputs).into_iter().map(bytes).collect();
-            self.function.call1(py, (tick.tick, given, blank))?.extract::<Vec<Vec<u8>>>(py)
+            self.function.call1(py, (tick.tick, given, tick.values, blank))?.extract::<Vec<Vec<u8>>>(py)
         });
         match computed {
             Ok(outputs) => fill(tick.outputs, &outputs),
@@ -107,8 +108,8 @@ fn words(py: Python<'_>, error: &PyErr) -> String {
     format(error).unwrap_or_else(|_| error.to_string()).trim_end().to_owned()
 }
 
-/// One tick on its way to a loop.
-type Asked = (u64, Vec<Option<Vec<u8>>>, Vec<Vec<u8>>);
+/// One tick on its way to a loop: inputs, values, blank outputs.
+type Asked = (u64, Vec<Option<Vec<u8>>>, Vec<f64>, Vec<Vec<u8>>);
 
 struct Handed {
     asked: SyncSender<Asked>,
@@ -117,7 +118,7 @@ struct Handed {
 
 impl RoleFunction for Handed {
     fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String> {
-        let asked = (tick.tick, inputs(&tick), blank(tick.outputs));
+        let asked = (tick.tick, inputs(&tick), tick.values.to_vec(), blank(tick.outputs));
         self.asked.send(asked).map_err(|_| LEFT.to_owned())?;
         fill(tick.outputs, &self.answers.recv().map_err(|_| LEFT.to_owned())?);
         Ok(())
@@ -150,7 +151,7 @@ impl Ticks {
         Self { line: Mutex::new(Some((ticks, give))), served: Some(served), leaves }
     }
 
-    /// Gives the outputs of the tick before, if there was one, and waits for the next: its number, inputs, and blank outputs. None
+    /// Gives the outputs of the tick before, if there was one, and waits for the next: its number, inputs, values, and blank outputs. None
     /// at the end of the run.
     #[pyo3(signature = (outputs))]
     fn next(&mut self, py: Python<'_>, outputs: Option<Vec<Vec<u8>>>) -> PyResult<Option<Asked>> {

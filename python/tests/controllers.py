@@ -15,6 +15,32 @@ def controller(tick, inputs, outputs):
         outputs.command.acceleration_rad_s2 = LAW.command(inputs.estimate.omega_rad_s, measured.omega_rad_s, measured.applied_rad_s2)
 
 
+# Parameters of the scenarios of examples/cart-pole and examples/motor-pair.
+GAIN = (-9.213, -9.695, -56.31, -12.66)
+INERTIA_KG_M2, FRICTION_N_M_S, TORQUE_N_M_PER_A = 1e-3, 2e-3, 5e-2
+
+
+def feedback(state, reference_m):
+    """Returns the force of cart-pole's law, in the order of its operations."""
+    error = (state[0] - reference_m, *state[1:])
+    position, speed, angle, rate = (gain * value for gain, value in zip(GAIN, error))
+    return -((position + angle) + (speed + rate))
+
+
+def cart_pole(tick, inputs, outputs):
+    estimate = inputs.estimate
+    if estimate is not None:
+        state = (estimate.position_m, estimate.speed_m_s, estimate.angle_rad, estimate.rate_rad_s)
+        outputs.command.force_n = feedback(state, inputs.value("reference.position_m"))
+
+
+def motor_pair(tick, inputs, outputs):
+    leader, own = inputs.estimate, inputs.measurement
+    if leader is not None and own is not None:
+        rise_rad_s2 = leader.rise_rad_s2 - inputs.value("motor.gain_per_s") * (own.speed_rad_s - leader.speed_rad_s)
+        outputs.command.current_a = (INERTIA_KG_M2 * rise_rad_s2 + FRICTION_N_M_S * own.speed_rad_s) / TORQUE_N_M_PER_A
+
+
 class Unpicklable(Exception):
     def __init__(self, message, detail):
         # Pickle stores only the arguments of the base class, so a copy lacks the second one.

@@ -214,7 +214,7 @@ line = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=int(sys.argv[
 assert sys.argv[1] == "serve-seat" and sys.argv[3] == "controller", sys.argv
 line.send(struct.pack("=QQQ", 1, 1, 2)); line.send(struct.pack("=Q", 2) + b"{}")
 for tick, present in enumerate([3, 1, 3]):
-    line.send(struct.pack("=QQQ6d", 3, tick, present, *range(6)))
+    line.send(struct.pack("=QQQ8d", 3, tick, present, *range(8)))
     kind, answered, *rest = struct.unpack("=QQ", line.recv(1 << 17)[:16])
     assert answered == tick, (answered, tick)
     if kind == 2:
@@ -229,7 +229,8 @@ line.send(struct.pack("=Q", 4))
         return {"service": f"corotate/x/{body}/{name}", "signal": name, "fields": stamp + fields}
 
     seat = {"program": [sys.executable, str(server)], "period_ns": 1_000_000, "writes": [signal_of("follower", "command", "current_a")],
-            "reads": [signal_of("leader", "estimate", "a", "b", "c"), signal_of("follower", "measurement", "d", "e")]}
+            "reads": [signal_of("leader", "estimate", "a", "b", "c"), signal_of("follower", "measurement", "d", "e")], "valid": 1,
+            "values": [{"key": "gain", "index": 0, "count": 2}, {"key": "set.point", "index": 2, "count": 1}]}
     from corotate import seat as module
     samples = module.Samples(seat)
     process = module.SeatProcess(seat, str(tmp_path), "controller", samples)
@@ -237,8 +238,11 @@ line.send(struct.pack("=Q", 4))
     while (tick := process.next(answer)) is not None:
         asked.append(tick)
         answer = [np.float64(1.0).tobytes()]
-    assert [number for number, _, _ in asked] == [0, 1, 2] and asked[1][1][1] is None
-    assert samples.inputs(asked[0][1]).measurement.e == 4.0 and process._process.returncode == 0
+    assert [number for number, *_ in asked] == [0, 1, 2] and asked[1][1][1] is None and process._process.returncode == 0
+    inputs = samples.inputs(*asked[0][1:3])
+    assert inputs.measurement.e == 4.0 and inputs.value("gain").tolist() == [5, 6] and inputs.value("set.point") == 7
+    with pytest.raises(KeyError, match=re.escape("set.point")):
+        inputs.value("other")
     process = module.SeatProcess(seat, str(tmp_path), "controller", samples)
     process.next(None)
     process.fail("Traceback: it raised")

@@ -11,6 +11,7 @@
 //! | `s` state | | numbers |
 //! | `r` replace the state | numbers | |
 //! | `i` input | JSON: key, and value in TOML | JSON: the tick from which it acts |
+//! | `c` commands | JSON: `Own` | the words of each command of the scenario's own controller, turn by turn, in a run of its own |
 //! | `f` finish | | JSON: the summary, and the directory of the results or null |
 //!
 //! An error is JSON: `invalid` if the scenario is, and `errors`, each a text and a code.
@@ -53,6 +54,16 @@ struct Begin {
     keep: bool,
     out: Option<PathBuf>,
     overwrite: bool,
+    /// The rig is the ideal one, without noise and rounding of its sensors.
+    ideal: bool,
+}
+
+/// A request for the commands of the scenario's own controller.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Own {
+    begin: Begin,
+    turns: u64,
 }
 
 /// Reads a scenario in its form, with overrides.
@@ -118,6 +129,7 @@ impl<'a> StepSession<'a> {
     pub fn answer(&mut self, request: &[u8]) -> Vec<u8> {
         let answer = match request.split_first() {
             Some((b'b', content)) => self.begin(content),
+            Some((b'c', content)) => self.own_commands(content),
             Some((operation, content)) => self.in_run(*operation, content),
             None => Err(malformed("it is empty").into()),
         };
@@ -149,10 +161,24 @@ impl<'a> StepSession<'a> {
         }
     }
 
+    fn scenario(&self, begin: &Begin) -> Result<Scenario, RequestError> {
+        let loaded = (self.load)(&begin.scenario, begin.kind, &begin.set);
+        let mut scenario = loaded.map_err(RequestError::invalid)?;
+        if begin.ideal {
+            scenario.rig = scenario.rig.ideal();
+        }
+        Ok(scenario)
+    }
+
+    fn own_commands(&self, content: &[u8]) -> Answer {
+        let own: Own = serde_json::from_slice(content).map_err(malformed)?;
+        let words = Steps::own_commands(self.scenario(&own.begin)?, own.turns)?;
+        Ok(words.iter().flat_map(|word| word.to_ne_bytes()).collect())
+    }
+
     fn begin(&mut self, content: &[u8]) -> Answer {
         let begin: Begin = serde_json::from_slice(content).map_err(malformed)?;
-        let load = || (self.load)(&begin.scenario, begin.kind, &begin.set).map_err(RequestError::invalid);
-        let (mut steps, mut scenario) = (Steps::new(load()?)?, load()?);
+        let (mut steps, mut scenario) = (Steps::new(self.scenario(&begin)?)?, self.scenario(&begin)?);
         let id = new_run().map_err(|error| Failure::new("no-random-numbers", error))?;
         scenario.clock = ClockKind::InProcess;
         scenario.inputs.receive_in(steps.received());
@@ -193,7 +219,7 @@ impl<'a> StepSession<'a> {
 impl SteppedRun {
     /// Observes the next tick. The samples are words: 1 after the last tick; the tick; the metric; the numbers of rejected and missed
     /// commands; the number of components of the applied commands, and these; 1 for each input that is present; the samples of all
-    /// inputs, zero where one is missing. The end of a body's motion follows as text.
+    /// inputs, zero where one is missing; the values of the seat's `values`. The end of a body's motion follows as text.
     fn observe(&mut self) -> Answer {
         self.is_over = !self.steps.observe()?;
         let (mut applied, mut rejected, mut missed) = (Vec::new(), 0, 0);
@@ -215,6 +241,7 @@ impl SteppedRun {
                 None => words.resize(words.len() + size, 0),
             }
         }
+        words.extend(self.steps.values().iter().map(|value| value.to_bits()));
         let lost = self.steps.bodies().find_map(|body| body.loss.map(|end| format!("{} {end}", body.body)));
         let mut bytes: Vec<u8> = words.iter().flat_map(|word| word.to_ne_bytes()).collect();
         bytes.extend_from_slice(lost.unwrap_or_default().as_bytes());
@@ -307,6 +334,7 @@ mod tests {
     fn begin(session: &mut StepSession<'_>, set: &[&str]) -> Vec<u8> {
         let begin = json!({
             "scenario": SHIPPED[0].1, "kind": "text", "set": set, "keep": false, "out": null, "overwrite": false,
+            "ideal": false,
         });
         session.answer(&[b"b", begin.to_string().as_bytes()].concat())
     }
@@ -320,7 +348,7 @@ mod tests {
     #[test]
     fn a_wrong_request_is_an_error_with_its_code_and_the_run_goes_on() {
         let mut session = session();
-        for request in [&b""[..], b"o", b"a", b"f", b"x", b"b{}", b"\xff\xff"] {
+        for request in [&b""[..], b"o", b"a", b"f", b"x", b"b{}", b"c{}", b"\xff\xff"] {
             let (invalid, code) = code(&session.answer(request));
             assert!(!invalid && ["malformed", "run-over"].contains(&&*code), "{request:?}: {code}");
         }

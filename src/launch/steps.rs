@@ -11,7 +11,8 @@ use crate::config::{ClockKind, InputInfo, InputUser, Variability};
 use crate::input::Change;
 use crate::inputs::{InputError, WantedChange, resolve};
 use crate::runtime::{
-    ReadyNode, RoleFunction, RoleId, RoleImpl, TickSamples, depths, ports, private_ledger, report, run_in_turn,
+    CurrentValues, ReadyNode, RoleFunction, RoleId, RoleImpl, TickSamples, depths, ports, private_ledger, report,
+    run_in_turn,
 };
 use crate::sample::{Field, Order, Place, Stamp};
 use crate::scenario::Scenario;
@@ -51,16 +52,43 @@ pub struct Steps {
     seats: Vec<(RoleId, Ledger)>,
     nodes: Vec<ReadyNode>,
     scorer: Box<dyn Scorer>,
-    /// The controller's inputs with the order of their samples, and each sample of the current tick.
-    readers: Vec<(WordReader, Order)>,
+    /// The controller's inputs, and each sample of the current tick.
+    readers: Vec<TickReader>,
     inputs: Vec<Option<Vec<u64>>>,
+    values: CurrentValues,
     outputs: Vec<Port>,
     commands: Rc<RefCell<Vec<Vec<u64>>>>,
     truths: Vec<TruthReader>,
     tick: u64,
     /// True from `observe` to `act`.
     observed: bool,
-    _bus: MemoryBus,
+    bus: MemoryBus,
+}
+
+/// A reader of the samples of one tick.
+struct TickReader {
+    reader: WordReader,
+    order: Order,
+}
+
+impl TickReader {
+    fn new(port: &Port, bus: &MemoryBus) -> Result<Self, BusError> {
+        Ok(Self { reader: port.reader(bus, Reader::Scorer)?, order: Order::default() })
+    }
+
+    /// Reads what has arrived. Returns true if it has a sample of this tick, which then replaces `sample`.
+    fn read(&mut self, tick: u64, sample: &mut Vec<u64>) -> Result<bool, BusError> {
+        let mut found = false;
+        while let Some(words) = self.reader.next()? {
+            let stamp: &Stamp = bytemuck::from_bytes(bytemuck::cast_slice(&words[..STAMP]));
+            if self.order.place(stamp, tick) == Place::Sample && stamp.tick == tick {
+                sample.clear();
+                sample.extend_from_slice(words);
+                found = true;
+            }
+        }
+        Ok(found)
+    }
 }
 
 /// The state of a body at the current tick, which no controller sees.
@@ -130,7 +158,12 @@ impl Steps {
     ///
     /// # Errors
     /// [`LaunchError`]; [`LaunchError::NotStepped`] if it has no controller, a fleet, or a role that a fault kills.
-    pub fn new(mut scenario: Scenario) -> Result<Self, LaunchError> {
+    pub fn new(scenario: Scenario) -> Result<Self, LaunchError> {
+        Self::open(scenario, true)
+    }
+
+    /// Creates a run whose controller is the caller, or the scenario's own.
+    fn open(mut scenario: Scenario, called: bool) -> Result<Self, LaunchError> {
         scenario.clock = ClockKind::InProcess;
         scenario.inputs.receive_in(ReceivedChanges::default());
         let refuse = |reason| Err(LaunchError::NotStepped { reason });
@@ -146,16 +179,15 @@ impl Steps {
         let scorer = open_scorer(&scenario, &bus)?;
         let seats: Vec<(RoleId, Ledger)> =
             roles.into_iter().map(|role| (role, private_ledger(&scenario, role))).collect();
-        let readers = controller_ports
-            .reads
-            .iter()
-            .map(|port| Ok::<_, BusError>((port.reader(&bus, Reader::Scorer)?, Order::default())));
-        let readers = readers.collect::<Result<Vec<_>, _>>()?;
+        let readers: Vec<TickReader> =
+            controller_ports.reads.iter().map(|port| TickReader::new(port, &bus)).collect::<Result<_, _>>()?;
         let content = |port: &Port| vec![0; port.size / size_of::<u64>() - STAMP];
         let commands = Rc::new(RefCell::new(controller_ports.writes.iter().map(content).collect()));
         let node = |(role, ledger): &(RoleId, Ledger)| {
             let role_impl = match role {
-                RoleId::Controller => RoleImpl::Function(*role, Box::new(CallerCommands(Rc::clone(&commands)))),
+                RoleId::Controller if called => {
+                    RoleImpl::Function(*role, Box::new(CallerCommands(Rc::clone(&commands))))
+                }
                 role => RoleImpl::from(*role),
             };
             build(&scenario, role_impl, &bus, ledger)
@@ -170,6 +202,7 @@ impl Steps {
         };
         let truths = truths.map(truth).collect::<Result<_, _>>()?;
         Ok(Self {
+            values: CurrentValues::new(&scenario.inputs, RoleId::Controller),
             scenario,
             seats,
             nodes,
@@ -181,7 +214,7 @@ impl Steps {
             truths,
             tick: 0,
             observed: false,
-            _bus: bus,
+            bus,
         })
     }
 
@@ -198,17 +231,9 @@ impl Steps {
             return Ok(false);
         }
         self.run_others()?;
-        for ((reader, order), input) in self.readers.iter_mut().zip(&mut self.inputs) {
-            let room = input.take();
-            while let Some(words) = reader.next()? {
-                let stamp: &Stamp = bytemuck::from_bytes(bytemuck::cast_slice(&words[..STAMP]));
-                if order.place(stamp, self.tick) == Place::Sample && stamp.tick == self.tick {
-                    let mut kept = room.clone().unwrap_or_default();
-                    kept.clear();
-                    kept.extend_from_slice(words);
-                    *input = Some(kept);
-                }
-            }
+        for (reader, input) in self.readers.iter_mut().zip(&mut self.inputs) {
+            let mut sample = input.take().unwrap_or_default();
+            *input = reader.read(self.tick, &mut sample)?.then_some(sample);
         }
         self.truths.iter_mut().try_for_each(|truth| truth.read(&self.scenario))?;
         self.observed = true;
@@ -232,6 +257,34 @@ impl Steps {
         Ok(())
     }
 
+    /// Runs a scenario with its own controller, and returns the words of the commands of its first turns, turn by turn, without stamps:
+    /// zeros where it sent none. They are fewer if the run has fewer turns.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn own_commands(scenario: Scenario, turns: u64) -> Result<Vec<u64>, LaunchError> {
+        let mut steps = Self::open(scenario, false)?;
+        let mut readers =
+            steps.outputs.iter().map(|port| TickReader::new(port, &steps.bus)).collect::<Result<Vec<_>, _>>()?;
+        let lengths: Vec<usize> = steps.outputs.iter().map(|port| port.size / size_of::<u64>()).collect();
+        let (mut commands, mut sample) = (Vec::new(), Vec::new());
+        for _ in 0..turns {
+            if !steps.observe()? {
+                break;
+            }
+            let tick = steps.tick;
+            steps.end_tick()?;
+            for (reader, length) in readers.iter_mut().zip(&lengths) {
+                if !reader.read(tick, &mut sample)? {
+                    sample.clear();
+                    sample.resize(*length, 0);
+                }
+                commands.extend_from_slice(&sample[STAMP..]);
+            }
+        }
+        Ok(commands)
+    }
+
     /// Returns the state of every body at the current tick.
     pub fn bodies(&self) -> impl Iterator<Item = &BodyState> {
         self.truths.iter().map(|truth| &truth.state)
@@ -240,6 +293,12 @@ impl Steps {
     /// Returns the controller's samples of the current tick: the estimate, then each driven body's measurement, as words with stamps.
     pub fn inputs(&self) -> &[Option<Vec<u64>>] {
         &self.inputs
+    }
+
+    /// Returns the values, at the current tick, of the inputs that the controller uses: gains, set points, the reference. Their order is
+    /// that of [`role_values`](crate::runtime::role_values).
+    pub fn values(&mut self) -> &[f64] {
+        self.values.at(self.tick)
     }
 
     /// Returns the numbers of the loop's state after [`observe`](Self::observe): those that each role passes to

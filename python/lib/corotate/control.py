@@ -1,15 +1,14 @@
 """A loop as a system of python-control."""
 
-import tempfile
-
 import control
 import numpy as np
 
 from .program import Program
-from .run import run
 from .scenario import given
 from .steps import Steps, session
 
+NO_STATE = ("the loop has no state at tick {tick}: its bodies and its observer keep no number that is finite there; begin at a later tick, "
+            "or list the fields that change in the rig's persist_fields!")
 NOT_KNOWN = "the loop has not been simulated to tick {tick}: simulate it from t = 0 on, or begin there with to_control(…, tick={tick})"
 
 
@@ -18,10 +17,12 @@ class Loop(control.NonlinearIOSystem):
 
 
 class _Stepper:
-    """Computes a tick of a loop from any state: counters, flags and noise are those after the commands before it."""
+    """Computes a tick of a loop from any state: counters, flags and noise are those after the commands before it. Ticks are those of
+    the controller, which may be slower than the bodies.
+    """
 
     def __init__(self, program, text, kind, changes):
-        self._begin = lambda: Steps(self._session, text, kind, changes)
+        self._begin = lambda: Steps(self._session, text, kind, changes, ideal=True)
         self._session = session(program)
         self.steps = self._begin()
         # The commands of the ticks so far; the next tick; what was computed last.
@@ -39,7 +40,7 @@ class _Stepper:
     def _go_to(self, tick):
         """Runs a loop up to a tick, with the commands before it."""
         if len(self.commands) < tick:
-            raise NotImplementedError(NOT_KNOWN.format(tick=tick))
+            raise NotImplementedError(NOT_KNOWN.format(tick=tick * self.steps.every_ticks))
         self.steps, self._tick = self._begin(), 0
         for command in [None, *self.commands[:max(tick - 1, 0)]][:tick]:
             self._advance(command)
@@ -65,26 +66,37 @@ def to_control(scenario, *, program=None, set={}, tick=0):
     state there, `u0` the command of that tick. So `control.linearize(system, system.x0, system.u0)` is the loop at that tick. Time 0 of
     the system is that tick, and a later time is computed for loops that were simulated to it (`control.input_output_response`).
 
-    Counters, flags, the memory of guards, and noise are no states: they are those of the loop at that tick. Where samples have noise,
-    it is the same for every state, so that a linearisation is that of the loop without noise. Quantisation has no derivative.
+    Counters, flags, the memory of guards, and noise are no states: they are those of the loop at that tick. A rig that declares its
+    `ideal` is without noise and rounding here. Noise of another one is the same for every state, so that a linearisation is that of the
+    loop without noise; quantisation has no derivative.
+
+    A controller with `every_ticks = n` makes a step of the system n ticks long, and `tick` a multiple of n. A loop without a state
+    raises ValueError.
     """
     text, kind = given(scenario)
     changes = {"accept": {}, **set, "clock": "in-process"}
     stepper = _Stepper(None if program is None else Program(program), text, kind, changes)
-    steps, tick_s = stepper.steps, stepper.steps.tick_s
+    steps, every = stepper.steps, stepper.steps.every_ticks
+    if tick % every:
+        raise ValueError(f"tick={tick}: the controller computes at every {every}. tick; give a multiple of {every}")
+    first, step_s = tick // every, steps.tick_s * every
     u0 = np.zeros(len(steps.action_names))
     x0 = stepper.initial
-    if tick:
-        stepper.commands = _commands(scenario, program, changes, steps, tick)
-        stepper._go_to(tick)
-        x0, u0 = np.concatenate([stepper.steps.state(), stepper.commands[tick - 1]]), stepper.commands[tick]
+    if first:
+        stepper.commands = list(steps.own_commands(first + 1))
+        if len(stepper.commands) <= first:
+            raise ValueError(f"tick={tick}: it is after the last tick of the scenario; take an earlier one, or a longer duration_s")
+        stepper._go_to(first)
+        x0, u0 = np.concatenate([stepper.steps.state(), stepper.commands[first - 1]]), stepper.commands[first]
     # A number that is not finite is unused so far: no state.
     used = np.isfinite(x0)
+    if not used[:len(x0) - len(u0)].any():
+        raise ValueError(NO_STATE.format(tick=tick))
 
     def at(time, state):
         full = x0.copy()
         full[used] = state
-        return tick + round(time / tick_s), full
+        return first + round(time / step_s), full
 
     def update(time, state, command, params):
         now, full = at(time, state)
@@ -99,24 +111,6 @@ def to_control(scenario, *, program=None, set={}, tick=0):
     inputs, outs = ([name.replace(".", " ") for name in names] for names in (steps.action_names, steps.observation_names))
     states = [name for name, there in zip(steps.state_names + [f"sent {name}" for name in inputs], used) if there]
     name = "corotate" if isinstance(scenario, dict) else str(scenario).replace(".", " ")
-    system = Loop(update, outputs, inputs=inputs, outputs=outs, states=states, dt=tick_s, name=name)
+    system = Loop(update, outputs, inputs=inputs, outputs=outs, states=states, dt=step_s, name=name)
     system.x0, system.u0 = x0[used], u0
     return system
-
-
-def _commands(scenario, program, changes, steps, tick):
-    """Returns the commands of the scenario's controller, tick by tick, up to a tick; zero where it sent none."""
-    with tempfile.TemporaryDirectory() as directory:
-        until = {**changes, "duration_s": min(changes.get("duration_s", np.inf), (tick + 1) * steps.tick_s)}
-        recording = run(scenario, program=program, clock="in-process", set=until, record=True, out=directory, overwrite=True).recording
-        columns, found = [], np.zeros((tick + 1, len(steps.action_names)))
-        for body, signal, dtype in steps.samples.writes:
-            name = f"{body}/{signal}"
-            values = recording.array(f"{name}.{dtype.names[0]}").reshape(len(recording.ticks(name)), -1)
-            columns.append((recording.ticks(name), values))
-    at = 0
-    for ticks, values in columns:
-        early = ticks <= tick
-        found[ticks[early].astype(int), at:at + values.shape[1]] = values[early]
-        at += values.shape[1]
-    return list(found)

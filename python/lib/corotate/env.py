@@ -8,17 +8,34 @@ from .program import Program
 from .scenario import given, seed_of, toml
 from .steps import Steps, session
 
-# Limits from the guards, by the beginning of a field's name: of measurements, of estimates, of commands that act.
+# The fields that the guards of the shipped rigs bound: of measurements and estimates, and of commands that act.
 RATES, APPLIED = ("omega_", "velocity_"), "applied_"
+
+
+def _bounds(limits):
+    """Returns a function of a number's name, which returns the largest magnitude that the guards accept."""
+    # A rig of a program bounds fields by their names.
+    named = {name.strip("|"): bound for name, bound in limits if name.startswith("|")}
+    measured, estimated, commanded = [bound for _, bound in limits] if limits and not named else [np.inf] * 3
+
+    def bound(name):
+        signal, _, field = name.partition("/")[2].partition(".")
+        if signal == "command" or field.startswith(APPLIED):
+            known = commanded
+        else:
+            known = (estimated if signal == "estimate" else measured) if field.startswith(RATES) else np.inf
+        return named.get(field.partition("[")[0], known)
+
+    return bound
 
 
 class Env(gymnasium.Env):
     """A scenario in one thread. The bits are those of a run with the same commands and the same seed.
 
-    An observation has every number of the estimate, then of each driven body's measurement, in SI units (`observation_names`), bounded
-    by what the guards accept; a number stays where its sample is missing. An action is the first field of each command
-    (`action_names`), bounded by `action_bound` or else by what the command guard accepts; with `normalize_actions` it is from -1 to 1
-    of that. The reward is minus the scenario's first metric.
+    An observation has every number of the estimate, then of each driven body's measurement, then the reference, if there is one
+    (`observation_names`), bounded by what the guards accept; a number stays where its sample is missing. An action is the first field of
+    each command (`action_names`), bounded by `action_bound` or else by what the command guard accepts; with `normalize_actions` it is
+    from -1 to 1 of that. The reward is minus the scenario's first metric.
 
     An episode is truncated at the scenario's last tick. It is terminated where a body's motion has met the end of its model:
     `info["reason"]` says how. Each step's `info` has `applied`, the command that acts from then on, in the unit of an action; and how many
@@ -36,23 +53,16 @@ class Env(gymnasium.Env):
         self._session = None
         steps = self._begin({})
         self.observation_names, self.action_names = steps.observation_names, steps.action_names
-        bounds = [bound for _, bound in steps.limits] or [np.inf] * 3
-        bound = bounds[-1] if action_bound is None else float(action_bound)
+        bounds = _bounds(steps.limits)
+        bound = bounds(self.action_names[0]) if action_bound is None else float(action_bound)
         if normalize_actions and not np.isfinite(bound):
             raise ValueError("normalize_actions=True: the scenario does not bound its commands; give action_bound")
         self._scale, largest = (bound, 1.0) if normalize_actions else (1.0, bound)
-        most = np.array([self._bound(name, bounds) for name in self.observation_names])
+        most = np.array([bounds(name) for name in self.observation_names])
         self.observation_space = gymnasium.spaces.Box(-most, most, dtype=np.float64)
         self.action_space = gymnasium.spaces.Box(-largest, largest, (len(self.action_names),), np.float64)
         self._steps = self._summary = None
         self._seeded = self._over = False
-
-    @staticmethod
-    def _bound(name, bounds):
-        signal, field = name.split("/")[1].split(".", 1)
-        if field.startswith(APPLIED):
-            return bounds[-1]
-        return bounds[signal == "estimate"] if field.startswith(RATES) else np.inf
 
     def _begin(self, more):
         changes = {**self._changes, **more}

@@ -25,7 +25,7 @@ from .scenario import given
 STAMP_FIELDS = 4
 # Kinds of frames to and from a process that serves a seat, and limits of their lengths, bytes.
 TICK, END, OUTPUTS, FAILURE = 3, 4, 1, 2
-FRAME_BYTES, TEXT_BYTES = 1 << 18, 32 << 10
+FRAME_BYTES, TEXT_BYTES = 160 << 10, 32 << 10
 
 
 class Sample:
@@ -88,6 +88,22 @@ class Group:
         return [sample._array.tobytes() for sample in self]
 
 
+class Inputs(Group):
+    """What a role reads at a tick: samples, and the values of the scenario's inputs that it uses."""
+
+    def __init__(self, entries, values, places):
+        super().__init__(entries)
+        self._values, self._places = values, places
+
+    def value(self, key):
+        """Returns an input of the scenario at this tick, such as `"reference.position_m"` or a gain: a number, or an array."""
+        try:
+            index, count = self._places[key]
+        except KeyError:
+            raise KeyError(f"the role uses no input {key!r}; it uses {', '.join(self._places) or 'no input'}") from None
+        return float(self._values[index]) if count == 1 else np.array(self._values[index:index + count], dtype=np.float64)
+
+
 def _layout(signal):
     """Returns body, signal and layout without the stamp of a signal in a seat."""
     fields = signal["fields"][STAMP_FIELDS:]
@@ -98,15 +114,18 @@ def _layout(signal):
 
 
 class Samples:
-    """The layouts of what a role reads and writes, from its seat."""
+    """The layouts of what a role reads and writes, from its seat. `values` has the place and the length of each input of the scenario
+    that it uses, by key.
+    """
 
     def __init__(self, seat):
         self.reads, self.writes = ([_layout(signal) for signal in seat[key]] for key in ("reads", "writes"))
+        self.values = {value["key"]: (value["index"], value["count"]) for value in seat["values"]}
 
-    def inputs(self, given):
+    def inputs(self, given, values):
         """What was read: None where a sample is missing."""
-        return Group([(body, signal, None if raw is None else Sample(np.frombuffer(raw, dtype), dtype.names))
-                      for (body, signal, dtype), raw in zip(self.reads, given)])
+        return Inputs([(body, signal, None if raw is None else Sample(np.frombuffer(raw, dtype), dtype.names))
+                       for (body, signal, dtype), raw in zip(self.reads, given)], values, self.values)
 
     def outputs(self, given):
         """What is to be written."""
@@ -128,10 +147,10 @@ def serve(domain, role, function):
     seat = _seat(domain, role)
     samples = Samples(seat)
 
-    def tick(number, inputs, blank):
+    def tick(number, inputs, values, blank):
         __tracebackhide__ = True
         outputs = samples.outputs(blank)
-        function(number, samples.inputs(inputs), outputs)
+        function(number, samples.inputs(inputs, values), outputs)
         return outputs.close()
 
     if not _is_foreign(seat):
@@ -161,8 +180,9 @@ def _domain(path, wait_s=10.0):
 class Seat:
     """A role of a run that waits for it: a loop over its ticks.
 
-    `run` is the path of the seat file, which `corotate run --external ROLE` prints, or the directory that the run's results go to
-    (`--out`); a run that is not there yet is waited for, for 10 s. Warm-up, heartbeat, counters, what is late and the report at the end are inside. `tick_s` is the period, s.
+    `run` is the path of the seat file, which `run --external ROLE` prints, or the directory that the run's results go to (`--out`); a
+    run that is not there yet is waited for, for 10 s. The run may be that of any program built on corotate. Warm-up, heartbeat,
+    counters, what is late and the report at the end are inside. `tick_s` is the period, s; `scenario` has the tables of the scenario.
 
         for tick, inputs, outputs in corotate.Seat(path, "controller"):
             outputs.command.acceleration_rad_s2[:] = law(inputs.estimate, inputs.measurement)
@@ -172,6 +192,7 @@ class Seat:
         self._domain_path = _domain(run)
         self._description = seat = _seat(self._domain_path, role)
         self._samples, self.role, self.tick_s = Samples(seat), role, seat["period_ns"] * 1e-9
+        self.scenario = seat["scenario"]
 
     def __iter__(self):
         if _is_foreign(self._description):
@@ -181,9 +202,9 @@ class Seat:
         answer = None
         try:
             while (asked := ticks.next(answer)) is not None:
-                number, inputs, blank = asked
+                number, inputs, values, blank = asked
                 outputs = self._samples.outputs(blank)
-                yield number, self._samples.inputs(inputs), outputs
+                yield number, self._samples.inputs(inputs, values), outputs
                 answer = outputs.close()
         finally:
             ticks.close()
@@ -204,11 +225,11 @@ def _seat(domain, role):
         raise _corotate.CorotateError(error) from None
 
 
-def _all_valid(dtype):
-    """Returns a sample of zeros whose `valid` has the bits of all components, as bytes."""
+def _blank(dtype, valid):
+    """Returns a sample of zeros but for the bits of its `valid`, as bytes."""
     blank = np.zeros(1, dtype)
     if "valid" in dtype.names:
-        blank["valid"] = 2**int(np.prod(dtype[0].shape)) - 1
+        blank["valid"] = valid
     return blank.tobytes()
 
 
@@ -217,39 +238,40 @@ class SeatProcess:
 
     def __init__(self, seat, domain, role, samples):
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._reads = [dtype.itemsize for _, _, dtype in samples.reads]
-        self._blank, self._tick = [_all_valid(dtype) for _, _, dtype in samples.writes], None
+        self._reads, self._frame = [dtype.itemsize for _, _, dtype in samples.reads], bytearray(FRAME_BYTES)
+        self._present = -(-len(self._reads) // 64) or 1
+        self._blank, self._tick = [_blank(dtype, seat["valid"]) for _, _, dtype in samples.writes], None
         with theirs:
             command = [*seat["program"], "serve-seat", domain, role, "--fd", str(theirs.fileno())]
             self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=2, pass_fds=[theirs.fileno()], start_new_session=True)
 
     def next(self, outputs):
-        """Gives the outputs of the tick before, if there was one, and waits for the next: its number, inputs and blank outputs. None
-        at the end of the run.
+        """Gives the outputs of the tick before, if there was one, and waits for the next: its number, inputs, values and blank
+        outputs. None at the end of the run.
         """
         if outputs is not None:
             self._send(struct.pack("=QQ", OUTPUTS, self._tick) + b"".join(outputs))
         while True:
             try:
-                frame = self._socket.recv(FRAME_BYTES)
+                length = self._socket.recv_into(self._frame)
             except ConnectionError:
-                frame = b""
-            kind = struct.unpack_from("=Q", frame)[0] if frame else None
+                length = 0
+            kind = struct.unpack_from("=Q", self._frame)[0] if length else None
             if kind == TICK:
-                return self._asked(frame)
+                return self._asked(bytes(self._frame[:length]))
             if kind == END:
-                return self._ended(frame[8:].decode())
+                return self._ended(self._frame[8:length].decode(errors="replace"))
             if kind is None:
                 self.close()
                 raise _corotate.CorotateError(f"the process that serves the seat ended with exit code {self._process.returncode}")
 
     def _asked(self, frame):
-        self._tick = struct.unpack_from("=Q", frame, 8)[0]
-        present, inputs, at = struct.unpack_from("=Q", frame, 16)[0], [], 24
+        self._tick, *present = struct.unpack_from(f"={1 + self._present}Q", frame, 8)
+        inputs, at = [], 16 + 8 * self._present
         for index, size in enumerate(self._reads):
-            inputs.append(frame[at:at + size] if present >> index & 1 else None)
+            inputs.append(frame[at:at + size] if present[index // 64] >> index % 64 & 1 else None)
             at += size
-        return self._tick, inputs, self._blank
+        return self._tick, inputs, np.frombuffer(frame, np.float64, offset=at), self._blank
 
     def _ended(self, text):
         self.close()

@@ -17,17 +17,25 @@ HEAD = struct.Struct("=QQdQQQ")
 class Steps:
     """A run by requests of a session; a session has one run at a time."""
 
-    def __init__(self, session, text, kind, changes, keep=False, out=None, overwrite=False):
+    def __init__(self, session, text, kind, changes, keep=False, out=None, overwrite=False, ideal=False):
         self._session = session
-        begin = {"scenario": text, "kind": kind, "set": overrides({**changes, "clock": "in-process"}), "keep": keep,
-                 "out": None if out is None else str(out), "overwrite": overwrite}
-        description = json.loads(self._ask(b"b", json.dumps(begin).encode()))
-        self.samples, self.tick_s = Samples(description["seat"]), description["seat"]["period_ns"] * 1e-9
+        self._request = {"scenario": text, "kind": kind, "set": overrides({**changes, "clock": "in-process"}), "keep": keep,
+                         "out": None if out is None else str(out), "overwrite": overwrite, "ideal": ideal}
+        description = json.loads(self._ask(b"b", json.dumps(self._request).encode()))
+        seat = description["seat"]
+        self.samples, self.tick_s, self.every_ticks = Samples(seat), seat["period_ns"] * 1e-9, seat["every_ticks"]
         self.limits = description["limits"]
         self.state_names = [f"{role}[{index}]" for role, count in description["state"] for index in range(count)]
         reads, writes = self.samples.reads, self.samples.writes
         self._sizes = [dtype.itemsize for _, _, dtype in reads]
         numbers = _columns(reads, _number_fields)
+        # The reference follows: its values come after the samples, and none is missing.
+        first = sum(self._sizes) // 8
+        for key, (index, count) in self.samples.values.items():
+            if key.startswith("reference."):
+                names = [key] if count == 1 else [f"{key}[{component}]" for component in range(count)]
+                numbers += [(name, first + index + component, len(reads)) for component, name in enumerate(names)]
+        self._values = sum(count for _, count in self.samples.values.values())
         self.observation_names, self._numbers = [name for name, _, _ in numbers], np.array([word for _, word, _ in numbers], dtype=int)
         self._owners, self.observation = np.array([signal for _, _, signal in numbers], dtype=int), np.zeros(len(numbers))
         actions = _columns(writes, lambda dtype: dtype.names[:1])
@@ -65,19 +73,20 @@ class Steps:
         at += 8 * applied
         present = struct.unpack_from(f"={len(self._sizes)}Q", seen, at)
         at += 8 * len(present)
-        words = np.frombuffer(seen, np.float64, sum(self._sizes) // 8, at)
+        words = np.frombuffer(seen, np.float64, sum(self._sizes) // 8 + self._values, at)
         # A number stays where its sample is missing.
         self.observation = words[self._numbers] if all(present) else np.where(
-            np.array(present, dtype=bool)[self._owners], words[self._numbers], self.observation)
+            np.array([*present, 1], dtype=bool)[self._owners], words[self._numbers], self.observation)
         self._raw = []
         for size, there in zip(self._sizes, present):
             self._raw.append(seen[at:at + size] if there else None)
             at += size
+        self.values, at = words[len(words) - self._values:], at + 8 * self._values
         self.loss = seen[at:].decode() or None
 
     def inputs(self):
         """Returns the samples that the controller has."""
-        return self.samples.inputs(self._raw)
+        return self.samples.inputs(self._raw, self.values)
 
     def outputs(self):
         """Returns samples for the controller to fill."""
@@ -94,6 +103,11 @@ class Steps:
     def set_input(self, key, text):
         """Changes an input to a value in TOML; returns the tick from which it acts."""
         return json.loads(self._ask(b"i", json.dumps([key, text]).encode()))
+
+    def own_commands(self, turns):
+        """Returns the actions of the scenario's own controller at its first turns, in a run of its own: (turns, numbers)."""
+        words = self._ask(b"c", json.dumps({"begin": self._request, "turns": turns}).encode())
+        return np.frombuffer(words).reshape(-1, len(self._commands))[:, self._actions]
 
     def finish(self):
         """Ends the run; returns its summary and the directory of its results, if they are kept."""

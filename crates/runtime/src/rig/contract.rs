@@ -184,7 +184,7 @@ pub trait Rig: Clone + Send + Sync + 'static {
         None
     }
     /// Returns the rig without noise and rounding of its sensors, for the analysis of a loop that [`isolated`](Self::isolated) does
-    /// not know.
+    /// not know, and for its linearisation.
     #[must_use]
     fn ideal(&self) -> Self {
         self.clone()

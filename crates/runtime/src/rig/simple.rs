@@ -172,7 +172,8 @@ pub trait SimpleRig: Serialize + DeserializeOwned + Clone + Send + Sync + 'stati
     fn inputs(&self) -> Vec<InputInfo> {
         Vec::new()
     }
-    /// Returns the rig without noise and rounding of its sensors. The analysis of `check` needs it to see how a small error falls.
+    /// Returns the rig without noise and rounding of its sensors. The analysis of `check` needs it to see how a small error falls, and the
+    /// package for Python to linearise the loop.
     #[must_use]
     fn ideal(&self) -> Self {
         self.clone()

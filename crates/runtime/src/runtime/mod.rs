@@ -54,7 +54,7 @@ pub use role_function::{RoleFunction, TickSamples};
 pub use role_id::RoleId;
 pub use role_impl::RoleImpl;
 pub use role_inputs::{NewValue, RoleInputs};
-pub use role_values::{RoleValue, role_values};
+pub use role_values::{CurrentValues, RoleValue, role_values};
 pub use usage::{ThreadUsage, watch_continued};
 
 use crate::bus::Depths;

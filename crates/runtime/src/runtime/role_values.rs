@@ -29,14 +29,16 @@ pub fn role_values(inputs: &Inputs, role: RoleId) -> Vec<RoleValue<'_>> {
     used_inputs
 }
 
-/// The values of a role at the current tick.
-pub(crate) struct CurrentValues {
+/// The values at the current tick of the inputs that a role uses.
+#[derive(Debug)]
+pub struct CurrentValues {
     inputs: RoleInputs,
     places: Vec<(InputUse, usize)>,
     values: Vec<f64>,
 }
 
 impl CurrentValues {
+    /// Collects the inputs that a role uses, with their values at the first tick.
     pub fn new(inputs: &Inputs, role: RoleId) -> Self {
         let used = role_values(inputs, role);
         Self {
@@ -46,7 +48,7 @@ impl CurrentValues {
         }
     }
 
-    /// Returns the values at a tick. Ticks do not decrease.
+    /// Returns the values at a tick, in the order of [`role_values`]. Ticks do not decrease.
     pub fn at(&mut self, tick: u64) -> &[f64] {
         if self.inputs.is_due(tick) {
             let (places, values) = (&self.places, &mut self.values);

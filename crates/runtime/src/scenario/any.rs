@@ -12,6 +12,7 @@ use crate::score::{Score, Scorer, TimedView, score_rig, timed_view};
 use crate::telemetry::{Ledger, RoleReport};
 use std::any::Any;
 use std::fmt;
+use std::sync::Arc;
 
 /// A rig of any type.
 pub trait AnyRig: WordView + Any + Send + Sync {
@@ -23,6 +24,8 @@ pub trait AnyRig: WordView + Any + Send + Sync {
     fn certificates(&self) -> Vec<CertificateReport>;
     /// Returns the physical bounds that the guards use.
     fn limits(&self) -> Vec<Figure>;
+    /// See [`Rig::ideal`].
+    fn ideal(&self) -> Arc<dyn AnyRig>;
     /// Returns the quantities that the controller can watch. A reason is given for each that cannot be watched in this scenario.
     fn monitors(&self) -> Vec<(&'static str, Option<&'static str>)>;
     /// Returns the scenario keys that may change while the loop runs.
@@ -79,6 +82,10 @@ impl<R: Rig> AnyRig for R {
 
     fn limits(&self) -> Vec<Figure> {
         Rig::limits(self)
+    }
+
+    fn ideal(&self) -> Arc<dyn AnyRig> {
+        Arc::new(Rig::ideal(self))
     }
 
     fn monitors(&self) -> Vec<(&'static str, Option<&'static str>)> {
