@@ -40,10 +40,11 @@ fn read(bytes: Vec<u8>, options: &Options) {
     }
     motion.end_segment();
     let (axes, tensor) = (motion.about_known_axes(true), motion.about_unknown_axes(true));
-    let _ = (motion.moments_about_known_axes(false), recursive.fit(), survey.choose());
-    assert!(!findings(&motion, axes.as_ref(), tensor.as_ref()).is_empty());
+    let body = motion.moments_about_known_axes(false);
+    let _ = (recursive.fit(), survey.choose());
+    assert!(!findings(&motion, axes.as_ref(), body.as_ref(), tensor.as_ref()).is_empty());
     let counts = log.counts();
-    assert_eq!(counts.rows, counts.used + counts.incomplete + counts.repeated);
+    assert_eq!(counts.rows, counts.used + counts.incomplete + counts.repeated + counts.outside);
 }
 
 fuzz_target!(|bytes: &[u8]| {

@@ -13,11 +13,13 @@ use serde_json::json;
 
 type Column<'py, T> = Bound<'py, PyArray1<T>>;
 
-/// A log as samples, and where a segment ends: before the samples whose label is another.
+/// A log as samples, and where a segment ends: before the samples whose label is another. The rate about the axis `hidden` may be
+/// unknown.
 fn samples(
     time: &PyReadonlyArray1<'_, f64>,
     rates: &PyReadonlyArray2<'_, f64>,
     segments: &PyReadonlyArray1<'_, i64>,
+    hidden: Option<usize>,
 ) -> PyResult<Vec<(bool, Sample)>> {
     let (time, rates, segments) = (time.as_slice()?, rates.as_array(), segments.as_slice()?);
     if rates.shape() != [time.len(), 3] || segments.len() != time.len() {
@@ -27,12 +29,28 @@ fn samples(
             time.len()
         )));
     }
-    let sample = |index: usize| {
+    let mut samples: Vec<(bool, Sample)> = Vec::with_capacity(time.len());
+    for index in 0..time.len() {
         let begins = index > 0 && segments[index] != segments[index - 1];
         let rate_rad_s = Vector3::new(rates[[index, 0]], rates[[index, 1]], rates[[index, 2]]);
-        (begins, Sample { time_s: time[index], rate_rad_s })
-    };
-    Ok((0..time.len()).map(sample).collect())
+        let earlier = samples.last().is_some_and(|(_, last)| !begins && time[index] <= last.time_s);
+        if !time[index].is_finite() || earlier {
+            return Err(PyValueError::new_err(format!(
+                "the time of sample {index}, {} s, is not after that of the sample before, or not finite; leave it out, or give \
+                 segments",
+                time[index]
+            )));
+        }
+        if let Some(axis) = (0..3).find(|axis| Some(*axis + 1) != hidden && !rate_rad_s[*axis].is_finite()) {
+            return Err(PyValueError::new_err(format!(
+                "the rate about {} of sample {index}, at {} s, is not finite; leave such samples out",
+                ["x", "y", "z"][axis],
+                time[index]
+            )));
+        }
+        samples.push((begins, Sample { time_s: time[index], rate_rad_s }));
+    }
+    Ok(samples)
 }
 
 /// Identifies a body from a log; returns JSON.
@@ -44,15 +62,8 @@ pub fn identify(
     segments: PyReadonlyArray1<'_, i64>,
     damping: bool,
 ) -> PyResult<String> {
-    let samples = samples(&time, &rates, &segments)?;
-    if let Some((_, sample)) = samples.iter().find(|(_, sample)| !sample.rate_rad_s.iter().all(|rate| rate.is_finite()))
-    {
-        return Err(PyValueError::new_err(format!(
-            "the rates at {} s are not finite; leave such rows out",
-            sample.time_s
-        )));
-    }
-    let value = py.detach(|| {
+    let samples = samples(&time, &rates, &segments, None)?;
+    let (value, refusal) = py.detach(|| {
         let mut motion = Motion::default();
         for (begins, sample) in &samples {
             if *begins {
@@ -63,9 +74,16 @@ pub fn identify(
         motion.end_segment();
         let (axes, body, tensor) =
             (motion.about_known_axes(damping), motion.moments_about_known_axes(damping), motion.about_unknown_axes(damping));
-        let found = findings(&motion, axes.as_ref(), tensor.as_ref());
+        let found = findings(&motion, axes.as_ref(), body.as_ref(), tensor.as_ref());
+        // As the command, it gives no body that the motion contradicts.
+        let refusal = |whole: bool| {
+            found.iter().find(|finding| if whole { finding.forbids_tensor() } else { finding.forbids_axes() })
+        };
+        let (axes_refusal, tensor_refusal) = (refusal(false), refusal(true));
+        let (body, tensor) = (body.filter(|_| axes_refusal.is_none()), tensor.filter(|_| tensor_refusal.is_none()));
+        let refused = axes_refusal.zip(tensor_refusal).map(|(about_axes, _)| about_axes.to_string());
         let list = |vector: &Vector3<f64>| vector.as_slice().to_vec();
-        json!({
+        let value = json!({
             "coefficients": axes.as_ref().map(|fit| list(&fit.coefficients)),
             "coefficients_deviation": axes.as_ref().and_then(|fit| fit.deviation.as_ref().map(list)),
             "closure": axes.as_ref().map(|fit| fit.closure()),
@@ -77,9 +95,13 @@ pub fn identify(
             "tensor_deviation": tensor.as_ref().and_then(|fit| fit.deviation.as_ref().map(list)),
             "axes": tensor.as_ref().map(|fit| fit.axes.row_iter().map(|row| row.iter().copied().collect::<Vec<f64>>()).collect::<Vec<_>>()),
             "findings": found.iter().map(ToString::to_string).collect::<Vec<_>>(),
-        })
+        });
+        (value, refused)
     });
-    Ok(value.to_string())
+    match refusal {
+        Some(refusal) => Err(PyValueError::new_err(refusal)),
+        None => Ok(value.to_string()),
+    }
 }
 
 /// Estimates the rate about a hidden axis (1 to 3), rad/s, NaN before the first information; and returns whether each step was
@@ -114,7 +136,7 @@ pub fn reconstruct<'py>(
         floor_rad_s,
     };
     let mut reconstruction = Reconstruction::new(&setup).map_err(|error| PyValueError::new_err(error.to_string()))?;
-    let samples = samples(&time, &rates, &segments)?;
+    let samples = samples(&time, &rates, &segments, Some(hidden))?;
     let (estimates, seen): (Vec<f64>, Vec<bool>) = py.detach(|| {
         let each = samples.iter().map(|(begins, sample)| {
             if *begins {

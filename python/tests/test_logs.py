@@ -43,6 +43,33 @@ def test_wrong_arguments_raise():
         corotate.identify(T, np.zeros((len(T), 2)))
     with pytest.raises(ValueError, match=rf"\b{T[0]:g} s\b.*\bfinite\b"):
         corotate.identify(T, np.full((len(T), 3), np.nan))
+    w = euler(BODY, [0.6, -0.4, 0.8], T)
+    for index, value in ((5, T[4]), (5, T[3]), (5, np.nan), (0, np.inf)):
+        t = T.copy()
+        t[index] = value
+        for call in (corotate.identify, corotate.HiddenRate(BODY, decay=4.0).filter):
+            with pytest.raises(ValueError, match=rf"\bsample {index}\b"):
+                call(t, w)
+    w[7, 0] = np.nan
+    with pytest.raises(ValueError, match=r"\bx of sample 7\b"):
+        corotate.HiddenRate(BODY, decay=4.0).filter(T, w)
+
+
+def test_dates_are_times():
+    w = euler(BODY, [0.6, -0.4, 0.8], T)
+    dates = np.datetime64("2026-11-28T12:00:00") + (T * 1e9).round().astype("timedelta64[ns]")
+    rate, _ = corotate.HiddenRate(BODY, decay=5.0).filter(dates, w)
+    expected, _ = corotate.HiddenRate(BODY, decay=5.0).filter(T, w)
+    assert np.nanmax(np.abs(rate - expected)) < 1e-6
+    assert np.allclose(corotate.identify(dates, w, damping=False).moments, np.array(BODY) / 2.5, atol=1e-3)
+
+
+def test_a_motion_that_is_not_free_or_in_another_unit_gives_no_body():
+    driven = np.stack([np.sin(3 * T), np.cos(2 * T) + 1, 0.5 * T], 1)
+    with pytest.raises(ValueError, match="free rigid body"):
+        corotate.identify(T, driven)
+    with pytest.raises(ValueError, match="unit"):
+        corotate.identify(T, np.degrees(euler(BODY, [0.6, -0.4, 0.8], T)))
 
 
 @pytest.mark.parametrize("name, body, target, damping", [("orbit-hold", "spacecraft", 1.3, 1.8), ("orbit-rendezvous", "follower", None, 2.0)])

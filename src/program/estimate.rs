@@ -24,6 +24,11 @@ const ROWS_PER_GROUP: usize = 1 << 17;
 /// The largest number of segments that are listed individually.
 const LISTED: usize = 12;
 
+/// The error as a part of the rate from which a body does not fit.
+const MISFIT: f64 = 0.5;
+const TOO_LONG: &str = "the steps are too long for the motion, which turns by more than half a turn in one, or does not fit the \
+                        body; log faster, and check the units";
+
 /// Options of `corotate estimate`.
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
@@ -35,7 +40,7 @@ pub struct Arguments {
     /// Axis of the estimated rate: x, y or z; its column, if any, serves only the score
     #[arg(long, value_name = "AXIS", value_parser = axis)]
     hidden: usize,
-    /// Body: a file with the output of `corotate identify --json`
+    /// Body: the output of `corotate identify --json`
     #[arg(long, value_name = "FILE", conflicts_with = "inertia", required_unless_present = "inertia")]
     body: Option<PathBuf>,
     /// Body: its principal moments of inertia, in any unit
@@ -149,7 +154,8 @@ pub fn estimate(arguments: &Arguments) -> CommandResult {
     let mut page = arguments.page.is_some().then(HiddenPage::default);
     let table = arguments.table.as_deref().map(Table::begin).transpose();
     let mut table = table.map_err(|error| unwritten(&arguments.table, error))?;
-    let done = estimate_log(&arguments.data, &arguments.log.options(), &request, |row, segment| {
+    let options = arguments.log.options().map_err(|error| fail(exit_of(&error), error))?;
+    let done = estimate_log(&arguments.data, &options, &request, |row, segment| {
         if let Some(page) = &mut page {
             let (estimate, measured) = (&row.estimate, row.principal_rad_s[request.axis - 1]);
             page.push(row.entry.begins, row.entry.time_s, estimate.rate_rad_s, measured, estimate.observed);
@@ -179,7 +185,39 @@ pub fn estimate(arguments: &Arguments) -> CommandResult {
             files.fold(harmless(&results), |text, path| format!("{text}{}\n", path.display()))
         }
     };
-    say(&text)
+    say(&text)?;
+    useless(&estimation).map_or(Ok(Exit::Ok), |failure| Err(fail(Exit::Failure, failure)))
+}
+
+/// Returns the reason why no sample has a usable estimate.
+fn useless(estimation: &Estimation) -> Option<Failure> {
+    let [samples, unobserved, too_long] = totals(&estimation.segments);
+    let steps = samples.saturating_sub(estimation.segments.len() as u64);
+    if 10 * estimation.diverged > samples {
+        let reason = "the estimate diverged: the body or its damping is another one, or a unit; see the numbers above";
+        return Some(Failure::new("diverged", reason));
+    }
+    if unobserved < steps || steps == 0 {
+        return None;
+    }
+    Some(match 2 * too_long > unobserved {
+        true => Failure::new("steps-too-long", format!("no estimate: {TOO_LONG}")),
+        false => {
+            Failure::new("never-observed", "no estimate: the measured rates are too small at every sample; see --floor")
+        }
+    })
+}
+
+/// Returns the numbers of samples, of unobservable steps, and of those that were too long.
+fn totals(segments: &[(String, SegmentScore)]) -> [u64; 3] {
+    segments.iter().fold([0; 3], |[samples, unobserved, too_long], (_, score)| {
+        [samples + score.samples, unobserved + score.unobserved, too_long + score.too_long]
+    })
+}
+
+/// Returns a number with four decimals, or in powers of ten if it is large.
+fn figure(value: f64) -> String {
+    if value.abs() < 1e6 { format!("{value:.4}") } else { format!("{value:.3e}") }
 }
 
 fn exit(error: &EstimateError) -> Exit {
@@ -358,6 +396,11 @@ fn overall(segments: &[(String, SegmentScore)]) -> Option<Overall> {
     })
 }
 
+/// Returns a part as per cent.
+fn percent(part: f64) -> String {
+    if part < 1e4 { format!("{:.2}", 100.0 * part) } else { format!("{:.2e}", 100.0 * part) }
+}
+
 /// Returns a part of the text without its indents, one sentence per line; a deeper indent continues a sentence.
 fn paragraph(part: &str) -> String {
     part.trim().replace("\n    ", " ").replace("\n  ", "\n")
@@ -397,37 +440,56 @@ fn write_results(request: &Request, estimation: &Estimation, text: &mut String) 
             choice.noise_rad_s, choice.balance_per_s, choice.segment_s, choice.forgetting_per_s
         )?;
     }
-    let (samples, unobserved) = estimation
-        .segments
-        .iter()
-        .fold((0, 0), |(samples, unobserved), (_, score)| (samples + score.samples, unobserved + score.unobserved));
-    let share = 100.0 * unobserved as f64 / samples.max(1) as f64;
+    let [samples, unobserved, too_long] = totals(&estimation.segments);
+    let blind = unobserved - too_long;
+    let share = 100.0 * blind as f64 / samples.max(1) as f64;
     let floor = estimation.floor_rad_s;
     writeln!(
         text,
-        "  not observable at {unobserved} of {samples} samples ({share:.1} %): both measured rates below {floor:.2e} rad/s"
+        "  not observable at {blind} of {samples} samples ({share:.1} %): both measured rates below {floor:.2e} rad/s"
     )?;
+    if too_long > 0 {
+        writeln!(text, "  ambiguous at {too_long} of {samples} samples: {TOO_LONG}")?;
+    }
+    if estimation.diverged > 0 {
+        let diverged = estimation.diverged;
+        writeln!(
+            text,
+            "  diverged at {diverged} of {samples} samples: the body or its damping is another one, or a unit"
+        )?;
+    }
     match overall(&estimation.segments) {
         Some(overall) => {
             writeln!(
                 text,
-                "\nrms error over the second half of {} segments: median {:.4}, 90th percentile {:.4} rad/s",
-                overall.scored, overall.error_rad_s[0], overall.error_rad_s[1]
+                "\nrms error over the second half of {} segments: median {}, 90th percentile {} rad/s",
+                overall.scored,
+                figure(overall.error_rad_s[0]),
+                figure(overall.error_rad_s[1])
             )?;
             writeln!(
                 text,
-                "  relative to the rate, {:.3} rad/s rms (median): median {:.2} %, 90th percentile {:.2} %",
+                "  relative to the rate, {:.3} rad/s rms (median): median {} %, 90th percentile {} %",
                 overall.measured_rad_s,
-                100.0 * overall.part[0],
-                100.0 * overall.part[1]
+                percent(overall.part[0]),
+                percent(overall.part[1])
             )?;
+            if overall.part[0] > MISFIT {
+                writeln!(
+                    text,
+                    "note: the body does not fit this motion: its axes, its moments, its damping or a unit is another"
+                )?;
+            }
         }
-        None => writeln!(text, "\nno score: the log lacks the rate about {hidden}")?,
+        None if estimation.log.meaning.rates.0[request.axis - 1] == "-" => {
+            writeln!(text, "\nno score: the log lacks the rate about {hidden}")?;
+        }
+        None => writeln!(text, "\nno score: no sample has both an estimate and a measured rate about {hidden}")?,
     }
     if overall(&estimation.segments).is_some() && estimation.segments.len() <= LISTED {
         for (name, score) in &estimation.segments {
             let (error, measured) = (score.error_rad_s, score.measured_rad_s);
-            writeln!(text, "  {name}: {error:.4} of {measured:.3} rad/s, {} samples", score.samples)?;
+            writeln!(text, "  {name}: {} of {measured:.3} rad/s, {} samples", figure(error), score.samples)?;
         }
     }
     Ok(())
@@ -451,6 +513,7 @@ fn to_json(request: &Request, estimation: &Estimation) -> Value {
         "filter": filter,
         "floor_rad_s": estimation.floor_rad_s,
         "rate_chosen": estimation.chosen,
+        "diverged": estimation.diverged,
         "choice": estimation.choice.map(|choice| json!({
             "decay_per_s": choice.decay_per_s, "balance_per_s": choice.balance_per_s,
             "forgetting_per_s": choice.forgetting_per_s, "noise_rad_s": choice.noise_rad_s,
@@ -464,6 +527,7 @@ fn to_json(request: &Request, estimation: &Estimation) -> Value {
         })),
         "segments": estimation.segments.iter().map(|(name, score)| json!({
             "name": name, "samples": score.samples, "scored": score.scored, "unobserved": score.unobserved,
+            "too_long": score.too_long,
             "error_rad_s": score.error_rad_s, "measured_rad_s": score.measured_rad_s,
         })).collect::<Vec<_>>(),
     })

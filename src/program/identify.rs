@@ -81,7 +81,8 @@ pub fn identify(arguments: &Arguments) -> CommandResult {
         ));
     }
     let ways = Ways { damping: !arguments.no_damping, decay: arguments.decay, symmetry_axis: arguments.symmetry_axis };
-    let identified = identify_logs(&arguments.data, &arguments.log.options(), &ways);
+    let options = arguments.log.options();
+    let identified = options.and_then(|options| identify_logs(&arguments.data, &options, &ways));
     let identified = identified.map_err(|error| fail(exit_of(&error), error))?;
     let body = body(arguments, &identified);
     let text = match arguments.json {
@@ -98,9 +99,12 @@ fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, Failure>
         Method::Tensor => finding.forbids_tensor(),
         Method::Axes | Method::Recursive => finding.forbids_axes(),
         // Its single coefficient needs spin about one axis only.
-        Method::Axisymmetric => matches!(finding, Finding::Short { .. } | Finding::Still { .. }),
+        Method::Axisymmetric => finding.forbids_axes() && !matches!(finding, Finding::Unexcited { .. }),
     };
     if let Some(finding) = identified.findings.iter().find(forbids) {
+        if matches!(finding, Finding::NotFree { .. } | Finding::Scaled { .. }) {
+            return Err(Failure::from(*finding));
+        }
         return Err(Failure::prefixed("the log does not determine a body", *finding));
     }
     let nothing =

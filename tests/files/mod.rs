@@ -4,6 +4,7 @@ mod damage;
 mod directories;
 mod earlier;
 mod junit;
+mod logs;
 mod own_data;
 #[cfg(feature = "parquet")]
 mod parquet;

@@ -121,14 +121,14 @@ fn a_log_without_the_hidden_rate_is_estimated_without_a_score() {
 #[test]
 fn a_wrong_argument_or_log_is_refused_with_a_code_and_its_place() {
     let bench = Bench::new();
-    std::fs::write(bench.path("comma.csv"), "t_s;wx;wy;wz\n0,0;1;2;3\n").unwrap();
+    std::fs::write(bench.path("comma.csv"), "t_s;wx;wy;wz\n0,0;1;2;3\n0,1;1;2;x\n").unwrap();
     std::fs::write(bench.path("good.csv"), "t_s,wx,wy,wz\n0,1,2,3\n0.1,1,2,3\n0.2,1,2,3\n0.3,1,2,3\n0.4,1,2,3\n")
         .unwrap();
     std::fs::write(bench.path("none.json"), "{\"schema\":\"corotate/identify/v1\",\"body\":null}").unwrap();
     let body = ["--inertia", "1,2,2.5"];
     for (arguments, parts) in [
         (&["identify", "missing.csv"][..], &["missing.csv", "[cannot-read]"][..]),
-        (&["identify", "comma.csv"], &["comma.csv:2: column t_s: `0,0`", "[not-a-number]"]),
+        (&["identify", "comma.csv"], &["comma.csv:3: column wz: `x`", "[not-a-number]"]),
         (&["identify", "good.csv", "--rates", "a,b,c"], &["`a`", "[no-such-column]"]),
         (&["identify", "good.csv", "--rates", "wx,wy"], &["--rates <X,Y,Z>"]),
         (&["identify", "good.csv", "--time-unit", "min"], &["--time-unit <UNIT>"]),

@@ -9,6 +9,12 @@ from . import _corotate
 
 
 def _log(t, w, segments):
+    t = np.asarray(t)
+    if np.issubdtype(t.dtype, np.datetime64):
+        # Seconds since the first one: a float has no room for nanoseconds since 1970.
+        t = (t - t[:1]) / np.timedelta64(1, "s")
+    elif np.issubdtype(t.dtype, np.timedelta64):
+        t = t / np.timedelta64(1, "s")
     t = np.ascontiguousarray(t, dtype=float)
     w = np.ascontiguousarray(w, dtype=float)
     labels = np.zeros(len(t), dtype=np.int64) if segments is None else np.unique(np.asarray(segments), return_inverse=True)[1]
@@ -22,6 +28,7 @@ class Identified:
     `moments` are about the sensor's axes, (3,); `tensor_moments` and `axes`, (3, 3) with the principal axes as columns, are of the
     whole tensor. `coefficients` are those of Euler's equations, each axis by itself, and `closure` their identity, zero for every
     body. Deviations are standard deviations by resampling, None if there is too little. `findings` says what the log cannot tell.
+    `moments`, or `tensor_moments` and `axes`, are None if the log contradicts such a body.
     """
 
     coefficients: np.ndarray
@@ -42,12 +49,17 @@ def identify(t, w, *, segments=None, damping=True):
 
     Parameters
     ----------
-    t : (n,) s
+    t : (n,) s, or datetime64
     w : (n, 3) rad/s
     segments : (n,) labels
         Where a label changes, the motion was not free in between.
     damping : bool
         True to fit the torque of the air too.
+
+    Raises
+    ------
+    ValueError
+        if no free rigid body moves so, a value is not finite, or a time is not after the one before.
 
     >>> t = np.arange(0, 20, 0.01)
     >>> w = euler([1.0, 2.0, 2.5], [0.6, -0.4, 0.8], t)
@@ -94,7 +106,8 @@ class HiddenRate:
     def filter(self, t, w, *, segments=None):
         """Estimates the hidden rate along a log: (n,) rad/s, nan before the first information; and (n,) bool, true where a step was informative.
 
-        `t` is (n,) s, `w` (n, 3) rad/s; the hidden column is not read and may hold anything.
+        `t` is (n,) s, or datetime64, and rises within a segment; `w` is (n, 3) rad/s. The hidden column is not read and may hold
+        anything; other values must be finite (ValueError).
         """
         t, w, labels = _log(t, w, segments)
         return _corotate.reconstruct(t, w, labels, self._body, self.hidden, *self._filter, *self._rest)

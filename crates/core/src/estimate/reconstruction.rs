@@ -76,6 +76,8 @@ pub struct Reconstructed {
     pub rate_rad_s: f64,
     /// True if the step to this sample was observable. Otherwise the model advanced the estimate.
     pub observed: bool,
+    /// True if the step was too long for the motion, or the estimate is far off.
+    pub too_long: bool,
     /// The filter's standard deviation, rad/s, if it computes one.
     pub deviation_rad_s: Option<f64>,
 }
@@ -190,14 +192,14 @@ impl Reconstruction {
         }
         // On the clock and with the rates of a motion without damping, see `undamped`.
         let to = self.regressor(&(sample.rate_rad_s * self.growth));
-        let observed = match self.relation.observe(&from, &to, self.interval, self.filter.estimate().x) {
+        let (observed, too_long) = match self.relation.observe(&from, &to, self.interval, self.filter.estimate().x) {
             Observation::Seen(increment) => {
                 self.apply(&increment);
-                true
+                (true, false)
             }
             Observation::Unobservable { drift } => {
                 self.filter.predict(&drift, self.interval.length());
-                false
+                (false, self.relation.is_too_long(&from, &to))
             }
         };
         if self.growth == 1.0 {
@@ -206,7 +208,7 @@ impl Reconstruction {
             self.last = Some((sample.time_s, self.regressor(&sample.rate_rad_s)));
             self.filter = self.filter.with_guess(self.filter.estimate() / self.growth);
         }
-        self.result(observed)
+        Reconstructed { too_long, ..self.result(observed) }
     }
 
     /// Begins a segment. Its first sample carries no information about the hidden component.
@@ -235,7 +237,12 @@ impl Reconstruction {
     #[inline]
     fn result(&self, observed: bool) -> Reconstructed {
         let rate_rad_s = if self.begun { self.filter.estimate().x } else { f64::NAN };
-        Reconstructed { rate_rad_s, observed, deviation_rad_s: self.filter.deviation().map(|deviation| deviation.x) }
+        Reconstructed {
+            rate_rad_s,
+            observed,
+            too_long: false,
+            deviation_rad_s: self.filter.deviation().map(|deviation| deviation.x),
+        }
     }
 }
 

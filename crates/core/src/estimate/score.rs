@@ -1,6 +1,8 @@
 //! The comparison of the estimate with a measured component: root mean squares over the part of each segment in which
 //! the initial guess has decayed. Memory is bounded. A segment's score must not be read before it has ended.
 
+use super::Reconstructed;
+
 /// The longest segment, in samples, that is scored over its second half. Longer ones are scored over all but the
 /// first half of this number.
 const HALVED_SAMPLES: usize = 1 << 16;
@@ -18,6 +20,8 @@ pub struct SegmentScore {
     pub samples: u64,
     /// The number of samples, apart from the first, whose step was not observable.
     pub unobserved: u64,
+    /// The number of unobserved samples whose step was too long for the motion.
+    pub too_long: u64,
 }
 
 /// Sums over a segment.
@@ -47,14 +51,16 @@ pub struct Score {
     sums: Sums,
     samples: u64,
     unobserved: u64,
+    too_long: u64,
 }
 
 impl Score {
-    /// Adds a sample: the estimate, the measured value (NaN if missing), and whether the step was observable.
-    pub fn push(&mut self, estimate_rad_s: f64, measured_rad_s: f64, observed: bool) {
-        let pair = (estimate_rad_s - measured_rad_s, measured_rad_s);
+    /// Adds a sample: the estimate and the measured value, NaN if missing.
+    pub fn push(&mut self, estimate: &Reconstructed, measured_rad_s: f64) {
+        let pair = (estimate.rate_rad_s - measured_rad_s, measured_rad_s);
         self.samples += 1;
-        self.unobserved += u64::from(!observed && self.samples > 1);
+        self.unobserved += u64::from(!estimate.observed && self.samples > 1);
+        self.too_long += u64::from(estimate.too_long);
         if self.samples <= HALVED_SAMPLES as u64 {
             self.open.push(pair);
         } else {
@@ -72,8 +78,7 @@ impl Score {
     /// Ends a segment and returns its score; `None` if it had no sample.
     pub fn end_segment(&mut self) -> Option<SegmentScore> {
         self.close(self.open.len() / 2);
-        let (sums, samples, unobserved) = (self.sums, self.samples, self.unobserved);
-        (self.sums, self.samples, self.unobserved) = (Sums::default(), 0, 0);
+        let Self { sums, samples, unobserved, too_long, .. } = core::mem::take(self);
         let mean = |sum: f64| libm::sqrt(sum / sums.count as f64);
         (samples > 0).then(|| SegmentScore {
             error_rad_s: mean(sums.error),
@@ -81,6 +86,7 @@ impl Score {
             scored: sums.count,
             samples,
             unobserved,
+            too_long,
         })
     }
 }
@@ -89,11 +95,15 @@ impl Score {
 mod tests {
     use super::*;
 
+    fn estimate(rate_rad_s: f64, observed: bool) -> Reconstructed {
+        Reconstructed { rate_rad_s, observed, too_long: false, deviation_rad_s: None }
+    }
+
     #[test]
     fn the_second_half_is_scored_without_unknown_values() {
         let mut score = Score::default();
         for (estimate, measured) in [(9.0, 1.0), (9.0, 1.0), (5.0, 2.0), (f64::NAN, 2.0), (2.0, f64::NAN), (0.0, 3.0)] {
-            score.push(estimate, measured, measured > 1.0);
+            score.push(&self::estimate(estimate, measured > 1.0), measured);
         }
         let scored = score.end_segment().unwrap();
         assert_eq!((scored.scored, scored.samples, scored.unobserved), (1, 6, 2));
@@ -105,7 +115,7 @@ mod tests {
     fn a_long_segment_is_scored_after_its_start() {
         let mut score = Score::default();
         for sample in 0..200_000 {
-            score.push(if sample < HALVED_SAMPLES / 2 { 100.0 } else { 1.5 }, 1.0, true);
+            score.push(&estimate(if sample < HALVED_SAMPLES / 2 { 100.0 } else { 1.5 }, true), 1.0);
         }
         let scored = score.end_segment().unwrap();
         assert_eq!((scored.error_rad_s, scored.scored), (0.5, 200_000 - HALVED_SAMPLES as u64 / 2));

@@ -1,13 +1,30 @@
 //! The conclusions from a log about the body, and their limits, as sentences.
 
 use super::motion::{GROUPS, Motion};
-use super::{AxesFit, TensorFit};
+use super::{AxesFit, TensorFit, nearest_body};
 use nalgebra::Vector3;
 
 /// The number of standard deviations that counts as certain.
 const CERTAIN: f64 = 3.0;
-/// The part of a rate below which the motion does not obey Euler's equations.
+/// The part of a rate below which the motion does not obey Euler's equations, and the part of the motion of all rates that may
+/// be unexplained.
 const EXPLAINED: f64 = 0.9;
+const NEGLIGIBLE: f64 = 0.01;
+/// The deviation of a1 + a2 + a3 + a1 a2 a3 from 0, and of a coefficient beyond 1, from which no body has the coefficients.
+const OPEN: f64 = 0.1;
+/// Factors between rates in wrong units, of rate or time, and right ones: deg/s, mdps, mrad/s or ms, us, ns, rpm, rev/s.
+const SCALES: [f64; 7] = [
+    core::f64::consts::PI / 180.0,
+    core::f64::consts::PI / 180e3,
+    1e-3,
+    1e-6,
+    1e-9,
+    core::f64::consts::TAU / 60.0,
+    core::f64::consts::TAU,
+];
+/// The least ratio of the unexplained parts at the wrong and at the right scale, and the largest unexplained part at the right one.
+const BETTER: f64 = 4.0;
+const WELL: f64 = 0.02;
 /// The standard deviation from which a coefficient counts as unknown (no body's exceeds 1), and, where that is
 /// unknown, the least ratio of its effect on the rate to the residual.
 const UNKNOWN: f64 = 0.3;
@@ -74,6 +91,34 @@ pub enum Finding {
     Symmetric {
         /// The index of the axis of symmetry.
         axis: usize,
+    },
+    /// No free rigid body moves so.
+    #[error(
+        "this motion is not that of a free rigid body{}: R2 = {}, coefficients = {}, a1 + a2 + a3 + a1 a2 a3 = {closure:.3}, \
+         moments = {}; cut out the free motion{}",
+        if *whole { "" } else { " about the sensor's axes" }, three(r_squared), three(coefficients), three(moments),
+        if *whole { "" } else { ", or look at the whole tensor" }
+    )]
+    NotFree {
+        /// True for the whole tensor.
+        whole: bool,
+        /// The explained part of each rate's variance.
+        r_squared: Vector3<f64>,
+        /// The coefficients of Euler's equations.
+        coefficients: Vector3<f64>,
+        /// Their identity, zero for every body.
+        closure: f64,
+        /// The moments of the best fit, the largest 1.
+        moments: Vector3<f64>,
+    },
+    /// The rates, or the times, have another unit.
+    #[error(
+        "Euler's equations hold if the rates are {factor:.3e} times as large, or the times: the unit is another one; give that of \
+         the rates (deg/s?) or of the stamps (ms?)"
+    )]
+    Scaled {
+        /// The factor.
+        factor: f64,
     },
     /// The air damps the motion.
     #[error(
@@ -150,6 +195,8 @@ impl From<&Finding> for &'static str {
             Finding::Unexcited { .. } => "unexcited",
             Finding::Sphere => "sphere",
             Finding::Symmetric { .. } => "symmetric",
+            Finding::NotFree { .. } => "not-free",
+            Finding::Scaled { .. } => "implausible-unit",
             Finding::Damped { .. } => "damped",
             Finding::Driven { .. } => "driven",
             Finding::Unexplained { .. } => "unexplained",
@@ -163,17 +210,43 @@ impl From<&Finding> for &'static str {
 impl Finding {
     /// Returns true if the finding rules out a body about the sensor's axes.
     pub fn forbids_axes(&self) -> bool {
-        matches!(self, Self::Short { .. } | Self::Still { .. } | Self::Unexcited { .. })
+        matches!(
+            self,
+            Self::Short { .. }
+                | Self::Still { .. }
+                | Self::Unexcited { .. }
+                | Self::Scaled { .. }
+                | Self::NotFree { whole: false, .. }
+        )
     }
 
     /// Returns true if the finding rules out a whole tensor.
     pub fn forbids_tensor(&self) -> bool {
-        matches!(self, Self::Short { .. } | Self::Still { .. } | Self::Indistinct { .. })
+        matches!(
+            self,
+            Self::Short { .. }
+                | Self::Still { .. }
+                | Self::Indistinct { .. }
+                | Self::Scaled { .. }
+                | Self::NotFree { whole: true, .. }
+        )
     }
 }
 
-/// Returns the findings about these fits, the most serious first; always includes the unknown scale.
-pub fn findings(motion: &Motion, axes: Option<&AxesFit>, tensor: Option<&TensorFit>) -> Vec<Finding> {
+/// Returns three numbers as text.
+fn three(numbers: &Vector3<f64>) -> String {
+    let [x, y, z] = (*numbers).into();
+    format!("({x:.3}, {y:.3}, {z:.3})")
+}
+
+/// Returns the findings about these fits, about the sensor's axes each by itself and as one body, and of the whole tensor, the
+/// most serious first; always includes the unknown scale.
+pub fn findings(
+    motion: &Motion,
+    axes: Option<&AxesFit>,
+    body: Option<&TensorFit>,
+    tensor: Option<&TensorFit>,
+) -> Vec<Finding> {
     let summary = motion.summary();
     let mut found = Vec::new();
     if summary.samples < FEW_SAMPLES {
@@ -182,10 +255,13 @@ pub fn findings(motion: &Motion, axes: Option<&AxesFit>, tensor: Option<&TensorF
     if summary.turn_rad < 1.0 {
         found.push(Finding::Still { turn_rad: summary.turn_rad });
     }
+    found.extend(wrong_scale(motion).map(|factor| Finding::Scaled { factor }));
     if let Some(fit) = axes {
+        found.extend(body.and_then(|body| not_free(motion, fit, body)));
         about_axes(fit, &mut found);
     }
     if let Some(fit) = tensor {
+        found.extend(not_free_at_all(motion, fit));
         about_tensor(fit, &mut found);
     }
     if summary.pieces < 4 {
@@ -195,16 +271,80 @@ pub fn findings(motion: &Motion, axes: Option<&AxesFit>, tensor: Option<&TensorF
     found
 }
 
+/// Returns the factor of all rates, or times, at which the motion is that of a free body, if it is not 1 and that of a unit.
+pub fn wrong_scale(motion: &Motion) -> Option<f64> {
+    let scatter = motion.total().scatter.diagonal();
+    let noise = motion.noise().sum() * motion.total().samples as f64 / scatter.fixed_rows::<3>(0).sum();
+    let better = |whole: bool| {
+        // Where no body fits at all, everything is unexplained.
+        let own = motion.unexplained(whole, 1.0).unwrap_or(1.0);
+        let scales = SCALES.iter().filter_map(|factor| Some((motion.unexplained(whole, *factor)?, *factor)));
+        let (least, factor) = scales.min_by(|first, second| first.0.total_cmp(&second.0))?;
+        (least < WELL && own > BETTER * least && own > 2.0 * noise).then_some(factor)
+    };
+    better(false).or_else(|| better(true))
+}
+
+/// Returns true if the fit leaves a part of a rate that is neither noise nor negligible.
+fn leaves_motion(motion: &Motion, r_squared: &Vector3<f64>) -> bool {
+    let (total, noise) = (motion.total(), motion.noise());
+    let scatter = total.scatter.diagonal();
+    let whole: f64 = scatter.fixed_rows::<3>(0).sum();
+    (0..3).any(|axis| {
+        let left = (1.0 - r_squared[axis]) * scatter[axis] - 2.0 * noise[axis] * total.samples as f64;
+        // Without a rate at all, nothing is left.
+        left > (1.0 - EXPLAINED) * scatter[axis] && left > NEGLIGIBLE * whole
+    })
+}
+
+fn not_free(motion: &Motion, fit: &AxesFit, body: &TensorFit) -> Option<Finding> {
+    let certain = fit.deviation.map_or(Vector3::zeros(), |deviation| CERTAIN * deviation);
+    let a = &fit.coefficients;
+    let closure = fit.closure();
+    // Coefficients that the motion does not tell may be any.
+    let known = (0..3).all(|axis| is_excited(fit, axis));
+    let is_body = nearest_body(&body.moments).is_ok()
+        && closure.abs() <= OPEN + certain.norm()
+        && (0..3).all(|axis| a[axis].abs() <= 1.0 + OPEN + certain[axis]);
+    let explained = !leaves_motion(motion, &fit.r_squared) && !leaves_motion(motion, &body.r_squared);
+    (known && !is_body || !explained).then_some(Finding::NotFree {
+        whole: false,
+        r_squared: fit.r_squared,
+        coefficients: *a,
+        closure,
+        moments: body.moments,
+    })
+}
+
+fn not_free_at_all(motion: &Motion, fit: &TensorFit) -> Option<Finding> {
+    let [x, y, z] = fit.moments.into();
+    let coefficients = Vector3::new((y - z) / x, (z - x) / y, (x - y) / z);
+    let is_body = fit.distinction < DISTINCT || nearest_body(&fit.moments).is_ok();
+    let free = is_body && !leaves_motion(motion, &fit.r_squared);
+    (!free).then(|| Finding::NotFree {
+        whole: true,
+        r_squared: fit.r_squared,
+        coefficients,
+        closure: crate::model::closure(&coefficients),
+        moments: fit.moments,
+    })
+}
+
+/// Returns true if the motion depends enough on a coefficient.
+fn is_excited(fit: &AxesFit, axis: usize) -> bool {
+    let known = match fit.deviation {
+        Some(deviation) => deviation[axis] < UNKNOWN,
+        None => fit.excitation_rad_s[axis] > EXCITED * fit.residual_rad_s[axis],
+    };
+    fit.excitation_rad_s[axis] > 0.0 && known
+}
+
 fn about_axes(fit: &AxesFit, found: &mut Vec<Finding>) {
     let mut excited = [true; 3];
     for (axis, excited) in excited.iter_mut().enumerate() {
-        let (excitation_rad_s, residual_rad_s) = (fit.excitation_rad_s[axis], fit.residual_rad_s[axis]);
-        let known = match fit.deviation {
-            Some(deviation) => deviation[axis] < UNKNOWN,
-            None => excitation_rad_s > EXCITED * residual_rad_s,
-        };
-        *excited = excitation_rad_s > 0.0 && known;
+        *excited = is_excited(fit, axis);
         if !*excited {
+            let (excitation_rad_s, residual_rad_s) = (fit.excitation_rad_s[axis], fit.residual_rad_s[axis]);
             found.push(Finding::Unexcited { axis, excitation_rad_s, residual_rad_s });
         }
     }

@@ -7,14 +7,17 @@
 //! | `tensor` | the whole tensor and its principal axes |
 //! | `recursive` | the papers' identifiers along the log |
 //! | `spread` | the uncertainty of a result, by resampling |
+//! | `free` | the stretches of free motion in a log |
 //! | `findings` | the conclusions from a log, and its limits |
 //!
-//! All of it takes one pass and bounded memory. Pure: no clock, no I/O, no allocation except in `findings`, which
-//! needs `std`. Its only input is the angular velocity; the only torque it models is that of the air, −c I ω.
+//! All of it but `free` takes one pass and bounded memory. Pure: no clock, no I/O, no allocation except in `findings` and
+//! `free`, which need `std`. Its only input is the angular velocity; the only torque it models is that of the air, −c I ω.
 
 mod axes;
 #[cfg(feature = "std")]
 mod findings;
+#[cfg(feature = "std")]
+mod free;
 mod motion;
 mod recursive;
 mod spread;
@@ -22,7 +25,9 @@ mod tensor;
 
 pub use axes::AxesFit;
 #[cfg(feature = "std")]
-pub use findings::{Finding, findings};
+pub use findings::{Finding, findings, wrong_scale};
+#[cfg(feature = "std")]
+pub use free::free_stretches;
 pub use motion::{Motion, MotionSummary, Sample};
 pub(crate) use recursive::undamped;
 pub use recursive::{RecursiveAxisymmetricIdentifier, RecursiveFit, RecursiveIdentifier};

@@ -25,6 +25,9 @@ const PIECE_TURN_RAD: f64 = 8.0 * core::f64::consts::PI;
 /// The least number of samples in a piece, because its constants of integration are unknown.
 const PIECE_SAMPLES: u64 = 4;
 
+/// The part of white noise in differences of third order.
+const THIRD_POWER: f64 = 20.0;
+
 /// A sample of a log.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sample {
@@ -74,6 +77,11 @@ pub struct Motion {
     integral: Integral,
     piece: Piece,
     summary: MotionSummary,
+    /// The newest rate with its differences up to the third, and the number of samples since the segment began.
+    differences: [Vector3<f64>; 4],
+    in_row: usize,
+    /// The sum of the squares of the third ones, and their number.
+    third: (Vector3<f64>, u64),
 }
 
 /// A summary of a log.
@@ -100,6 +108,9 @@ impl Default for Motion {
             integral: Integral::default(),
             piece: Piece::default(),
             summary: MotionSummary::default(),
+            differences: [Vector3::zeros(); 4],
+            in_row: 0,
+            third: (Vector3::zeros(), 0),
         }
     }
 }
@@ -127,6 +138,16 @@ impl Motion {
         }
         self.summary.fastest_rad_s = self.summary.fastest_rad_s.max(sample.rate_rad_s.norm());
         self.summary.samples += 1;
+        let mut value = sample.rate_rad_s;
+        for difference in &mut self.differences {
+            value -= core::mem::replace(difference, value);
+        }
+        self.in_row += 1;
+        // By then those of the previous segment are gone.
+        if self.in_row > 3 {
+            self.third.0 += self.differences[3].component_mul(&self.differences[3]);
+            self.third.1 += 1;
+        }
         if let Some(features) = self.integral.push(sample) {
             self.add(&features);
         }
@@ -135,6 +156,7 @@ impl Motion {
     /// Ends a segment: the next sample begins another motion.
     pub fn end_segment(&mut self) {
         let ended = self.integral.end();
+        self.in_row = 0;
         self.summary.segments += u64::from(ended.is_some());
         if let Some(features) = ended {
             self.add(&features);
@@ -145,6 +167,11 @@ impl Motion {
     /// Returns the summary.
     pub fn summary(&self) -> &MotionSummary {
         &self.summary
+    }
+
+    /// Returns the variance of white noise in each rate, (rad/s)²: what differences of third order leave of the motion.
+    pub(super) fn noise(&self) -> Vector3<f64> {
+        self.third.0 / (THIRD_POWER * self.third.1.max(1) as f64)
     }
 
     /// Returns the sums over all pieces.

@@ -57,9 +57,9 @@ impl TensorFit {
 
 /// A tensor during the iteration.
 #[derive(Debug, Clone, Copy)]
-struct Solution {
+pub(super) struct Solution {
     /// The tensor, of trace 1.
-    tensor: Matrix3<f64>,
+    pub tensor: Matrix3<f64>,
     damping: f64,
     distinction: f64,
 }
@@ -76,6 +76,21 @@ impl Motion {
     /// [`about_unknown_axes`](Self::about_unknown_axes) with a diagonal tensor.
     pub fn moments_about_known_axes(&self, damping: bool) -> Option<TensorFit> {
         self.tensor(false, damping)
+    }
+
+    /// Fits a tensor, the whole one or about the sensor's axes, to the motion of rates times `scale`. Returns the unexplained part
+    /// of the variance of all rates; `None` if no body has the tensor.
+    pub(super) fn unexplained(&self, whole: bool, scale: f64) -> Option<f64> {
+        let mut total = self.total();
+        for product in PRODUCTS..TURNS {
+            total.scatter.row_mut(product).scale_mut(scale);
+            total.scatter.column_mut(product).scale_mut(scale);
+        }
+        let best = solve(&total, whole, true)?;
+        super::nearest_body(&principal(&best.tensor)?.0).ok()?;
+        let whole = total.scatter.diagonal().fixed_rows::<3>(0).into_owned();
+        let part = r_squared(&total, &best)?.map(|explained| 1.0 - explained);
+        Some(part.dot(&whole) / whole.sum())
     }
 
     fn tensor(&self, whole: bool, damping: bool) -> Option<TensorFit> {
@@ -151,7 +166,7 @@ fn maps(tensor: &Matrix3<f64>) -> [Row; 2] {
     [free, damped]
 }
 
-fn solve(sums: &Sums, whole: bool, with_damping: bool) -> Option<Solution> {
+pub(super) fn solve(sums: &Sums, whole: bool, with_damping: bool) -> Option<Solution> {
     let mut scatter = sums.scatter;
     scatter.fill_lower_triangle_with_upper_triangle();
     let largest = scatter.diagonal().max();
@@ -249,7 +264,7 @@ fn smallest(left: &Matrix6<f64>, right: &Matrix6<f64>, unknowns: usize) -> Optio
 }
 
 /// Returns the principal moments, the largest 1, and the axes, each the one closest to a sensor's axis.
-fn principal(tensor: &Matrix3<f64>) -> Option<(Vector3<f64>, Matrix3<f64>)> {
+pub(super) fn principal(tensor: &Matrix3<f64>) -> Option<(Vector3<f64>, Matrix3<f64>)> {
     let SymmetricEigen { eigenvalues, eigenvectors } = SymmetricEigen::try_new(*tensor, f64::EPSILON, SWEEPS)?;
     const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
     let aligned = |order: &[usize; 3]| (0..3).map(|axis| eigenvectors[(axis, order[axis])].abs()).sum::<f64>();
@@ -270,13 +285,18 @@ fn principal(tensor: &Matrix3<f64>) -> Option<(Vector3<f64>, Matrix3<f64>)> {
     (largest > 0.0).then(|| (moments / largest, axes))
 }
 
-/// Returns the explained part of each rate's variance.
-fn r_squared(sums: &Sums, solution: &Solution) -> Option<Vector3<f64>> {
+/// Returns the sums of the squares of each rate that the body does not explain.
+pub(super) fn left(sums: &Sums, solution: &Solution) -> Option<Vector3<f64>> {
     let mut scatter = sums.scatter;
     scatter.fill_lower_triangle_with_upper_triangle();
     let [free, damped] = maps(&solution.tensor);
     let left = solution.tensor.try_inverse()? * (free + damped * solution.damping);
-    let unexplained = (left * scatter * left.transpose()).diagonal();
+    Some((left * scatter * left.transpose()).diagonal())
+}
+
+/// Returns the explained part of each rate's variance.
+fn r_squared(sums: &Sums, solution: &Solution) -> Option<Vector3<f64>> {
+    let (scatter, unexplained) = (&sums.scatter, left(sums, solution)?);
     Some(Vector3::from_fn(|axis, _| {
         let whole = scatter[(axis, axis)];
         if whole > 0.0 { 1.0 - unexplained[axis] / whole } else { 0.0 }

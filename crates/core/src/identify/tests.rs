@@ -108,11 +108,17 @@ fn noise_does_not_bias_the_tensor_towards_a_sphere() {
     assert!((fit.moments - Vector3::from(tumble.moments)).amax() < 0.02, "{fit:?}");
 }
 
+/// Returns the findings about every fit.
+fn all_findings(motion: &Motion) -> Vec<Finding> {
+    let (axes, body) = (motion.about_known_axes(true), motion.moments_about_known_axes(true));
+    findings(motion, axes.as_ref(), body.as_ref(), motion.about_unknown_axes(true).as_ref())
+}
+
 #[test]
 fn the_limits_of_a_log_are_reported() {
     let found = |tumble: &Tumble| {
         let motion = tumble.motion();
-        findings(&motion, motion.about_known_axes(true).as_ref(), motion.about_unknown_axes(true).as_ref())
+        all_findings(&motion)
     };
     let noisy = Tumble { noise_rad_s: 0.02, ..Tumble::default() };
     assert_eq!(found(&noisy), [Finding::Scale]);
@@ -150,7 +156,7 @@ fn a_spin_about_one_axis_does_not_excite_the_others() {
         }
         motion.end_segment();
     }
-    let found = findings(&motion, motion.about_known_axes(true).as_ref(), motion.about_unknown_axes(true).as_ref());
+    let found = all_findings(&motion);
     let unknown = |f: &Finding| matches!(f, Finding::Unexcited { .. } | Finding::Indistinct { .. } | Finding::Sphere);
     assert!(found.iter().any(unknown), "{found:?}");
 }

@@ -398,6 +398,19 @@ impl HiddenRate {
         Some((estimate, increment.reconstruction().x - estimate))
     }
 
+    /// Returns true if both ends of a step carry information, but its turn is ambiguous: more than half a turn, or through both
+    /// branches of a hyperbola.
+    pub fn is_too_long(&self, from: &Regressor, to: &Regressor) -> bool {
+        let floor = self.constants.floor_z;
+        let seen = |at: &Regressor| match self.conic {
+            Conic::Elliptic { .. } => at.square > self.constants.floor,
+            Conic::Hyperbolic { .. } => (at.x + at.y).abs() > floor || (at.x - at.y).abs() > floor,
+            // A zero of the measured rate is passed in steps of any length.
+            Conic::ParabolicFirst | Conic::ParabolicSecond => false,
+        };
+        seen(from) && seen(to)
+    }
+
     fn unobservable(&self, from: &Regressor, to: &Regressor, interval: &Interval, estimate: f64) -> Observation {
         let push = [self.push(from, &from.torque), self.push(to, &from.torque)];
         Observation::Unobservable { drift: Vector1::new(drift(from, to, push, interval, estimate).0) }

@@ -1,89 +1,242 @@
 //! Finds the column and the unit of each quantity: from the options, else by name. Must not guess between two candidates.
 
 use super::form::{DataError, Meaning, Options};
+use super::plausible::since_1970;
+use super::stamp::Stamp;
 use super::unit::{RateUnit, TimeUnit};
 use std::path::Path;
 
-/// Names of a time stamp, without unit and axis.
-const STAMPS: [&str; 9] =
-    ["time", "t", "timestamp", "stamp", "seconds", "elapsed", "secondselapsed", "elapsedtime", "timesec"];
-/// Names of an angular velocity, without unit and axis.
-const RATES: [&str; 16] = [
-    "w",
-    // As in ax, ay, az, gx, gy, gz.
-    "g",
-    "omega",
-    "gyro",
-    "gyr",
-    "gyroscope",
-    "rate",
-    "rates",
-    "angularvelocity",
-    "angularrate",
-    "angvel",
-    "rotationrate",
-    "av",
-    "angularspeed",
-    "gyrorate",
-    "gyroraw",
+/// Names of a time stamp, without unit; the first list that has one decides.
+const STAMPS: [&str; 3] = [
+    "headerstamp sampletimefine",
+    "elapsed elapsedtime timeelapsed",
+    "time t timestamp stamp loggingtime systemtime unixtime devicetime sensortime datetime timeboot timestampsample rostime \
+     utc clock epoch",
 ];
+/// Words that make a name with another of them a time stamp, and words that prevent it.
+const STAMP_WORDS: &str = "time timestamp stamp elapsed";
+const NO_STAMP_WORDS: &str = "delta exposure zone interval diff of";
+/// Names of an angular velocity, without unit and axis; `g` as in ax, ay, az, gx, gy, gz.
+const RATES: &str = "w g ω omega gyro gyr gyros gyroscope rate rates bodyrate bodyrates angularvelocity angularrate angvel \
+                     rotationrate av angularspeed gyrorate gyroraw gyroadc motionrotationrate";
+/// Words that make a longer name that of an angular velocity, and parts of words that do.
+const RATE_WORDS: &str = "w omega gyr gyro ω";
+const RATE_PARTS: &str = "gyro angularvelocity angularrate angvel angularspeed rotationrate bodyrate omega";
+/// Words of quantities that are related to an angular velocity.
+const NO_RATE_WORDS: &str = "bias offset cov covariance std stddev var variance accel acc acceleration linear mag temp temperature \
+                             setpoint desired des target cmd command ref error noise";
+/// Words beside a unit that make it another one.
+const MODIFIERS: &str = "centi deci micro nano kilo per min minute h hr hour day ms us s2 sq squared 2s ns ss";
+/// Parts of words that look like a unit of angular velocity, and words that look like a unit of time.
+const LIKE_RATE: &str = "deg rad dps rpm rps grad gon lsb hz counts arcsec °";
+const LIKE_TIME: &str = "min mins minute minutes h hr hrs hour hours days tick ticks cycles frames samples jiffies ds";
+/// Words in brackets that describe a column.
+const DESCRIPTIONS: &str = "calibrated uncalibrated filtered body frame sensor imu gyroscope corrected";
 
-/// Returns the words of a name in lower case.
+/// Returns true if a list of words has a word.
+fn listed(list: &str, word: &str) -> bool {
+    list.split_whitespace().any(|own| own == word)
+}
+
+/// The unit in a name.
+#[derive(Debug, Clone, PartialEq)]
+enum Claim<U> {
+    Absent,
+    Known(U),
+    /// The text that looks like a unit.
+    Unknown(String),
+}
+
+/// Returns the words of a name in lower case; a word also begins at a capital, as in `TimeUS` and `IMUGyroX`.
 fn words(name: &str) -> Vec<String> {
-    let name = name.to_lowercase();
-    let words = name.split(|letter: char| !letter.is_alphanumeric() && letter != '°');
-    words.filter(|word| !word.is_empty()).map(str::to_owned).collect()
-}
-
-/// Returns the unit of time in a name: its last word.
-fn time_unit(name: &str) -> Option<TimeUnit> {
-    words(name).last().and_then(|word| TimeUnit::parse(word))
-}
-
-/// Returns true if a name is that of a time stamp.
-fn is_stamp(name: &str) -> bool {
-    let mut words = words(name);
-    if words.len() > 1 && time_unit(name).is_some() {
-        words.pop();
-    }
-    STAMPS.contains(&words.concat().as_str())
-}
-
-/// Returns the unit of angular velocity in a name.
-fn rate_unit(name: &str) -> Option<RateUnit> {
-    let words = words(name);
-    let has_word = |unit: &[&str]| words.iter().any(|word| unit.contains(&word.as_str()));
-    match (has_word(&["rad", "rads", "radians"]), has_word(&["deg", "dps", "degrees", "°"])) {
-        (true, false) => Some(RateUnit::RadiansPerSecond),
-        (false, true) => Some(RateUnit::DegreesPerSecond),
-        _ => None,
-    }
-}
-
-/// Returns the axis, 0 to 2, of the angular velocity with this name.
-fn rate_axis(name: &str) -> Option<usize> {
-    const UNITS: [&str; 11] = ["rad", "rads", "radians", "deg", "degrees", "dps", "°", "s", "sec", "per", "second"];
-    let mut words = words(name);
-    words.retain(|word| !UNITS.contains(&word.as_str()));
-    let last = words.pop()?;
-    let axis = |letter: &str| ["x", "y", "z"].iter().position(|axis| *axis == letter);
-    let index = |digit: &str| ["0", "1", "2"].iter().position(|index| *index == digit);
-    // A separate word, as in `gyro_x` and `omega_rad_s[0]`, or the end of a word, as in `wx`.
-    let (stem, axis) = match axis(&last).or_else(|| index(&last)) {
-        Some(axis) => (words.concat(), axis),
-        None => {
-            let at = last.char_indices().last()?.0;
-            (words.concat() + &last[..at], axis(&last[at..])?)
+    let letters: Vec<char> = name.chars().collect();
+    let mut words = vec![String::new()];
+    for (at, letter) in letters.iter().enumerate() {
+        let before = at.checked_sub(1).map(|at| letters[at]);
+        let after = letters.get(at + 1).is_some_and(|letter| letter.is_lowercase());
+        let begins = letter.is_uppercase()
+            && before.is_some_and(|before| before.is_lowercase() || (before.is_uppercase() && after));
+        let part = letter.is_alphanumeric() || "°º˚".contains(*letter);
+        if begins || !part {
+            words.push(String::new());
         }
+        if part {
+            words.last_mut().expect("it begins with one").extend(letter.to_lowercase());
+        }
+    }
+    words.retain(|word| !word.is_empty());
+    words
+}
+
+/// Returns a name with the text of brackets that hold an index or an axis, and the texts of all others.
+fn brackets(name: &str) -> (String, Vec<String>) {
+    let (mut plain, mut texts, mut rest) = (String::new(), Vec::new(), name);
+    while let Some(open) = rest.find(['(', '[', '{']) {
+        let inner = &rest[open + 1..];
+        let close = inner.find([')', ']', '}']).unwrap_or(inner.len());
+        plain.push_str(&rest[..open]);
+        let text = inner[..close].trim();
+        if text.chars().all(|letter| letter.is_ascii_digit()) || axis_of(&text.to_lowercase()).is_some() {
+            plain.push_str(&format!(" {text} "));
+        } else {
+            texts.push(text.to_owned());
+            plain.push(' ');
+        }
+        rest = inner.get(close + 1..).unwrap_or_default();
+    }
+    (plain + rest, texts)
+}
+
+/// Returns the unit in a name, and the other words.
+fn split<U>(name: &str, parse: fn(&str) -> Option<U>, is_like: fn(&str) -> bool) -> (Claim<U>, Vec<String>) {
+    let (plain, texts) = brackets(name);
+    let mut words = words(&plain);
+    if let Some(unit) = texts.iter().find_map(|text| parse(text)) {
+        return (Claim::Known(unit), words);
+    }
+    let describes = |text: &&String| text.split_whitespace().any(|word| listed(DESCRIPTIONS, &word.to_lowercase()));
+    if let Some(text) = texts.iter().find(|text| !describes(text)) {
+        return (Claim::Unknown(text.clone()), words);
+    }
+    for length in (1..=4.min(words.len())).rev() {
+        for at in (0..=words.len() - length).rev() {
+            // A digit is an index.
+            let run = words[at..at + length].iter();
+            let text: String = run.map(|word| if word.parse::<u32>().is_ok() { "-" } else { word.as_str() }).collect();
+            let Some(unit) = parse(&text).filter(|_| !text.contains('-')) else { continue };
+            let beside = [at.checked_sub(1).map(|at| &words[at]), words.get(at + length)];
+            if beside.into_iter().flatten().any(|word| listed(MODIFIERS, word)) || plain.contains(['^', '²']) {
+                return (Claim::Unknown(words[at.saturating_sub(1)..].join(" ")), words);
+            }
+            words.drain(at..at + length);
+            return (Claim::Known(unit), words);
+        }
+    }
+    // As in `wx spins/min` and `Gyro X ?/s`.
+    let last = plain.split([' ', ',']).next_back().unwrap_or_default();
+    let per = last.rsplit_once('/').map_or("", |(_, per)| per);
+    if ["s", "sec", "second", "min", "minute", "h", "hr", "hour", "ms"].contains(&per.to_lowercase().as_str()) {
+        return (Claim::Unknown(last.to_owned()), words);
+    }
+    match words.iter().find(|word| is_like(word)) {
+        Some(word) => (Claim::Unknown(word.clone()), words.clone()),
+        None => (Claim::Absent, words),
+    }
+}
+
+fn time_claim(name: &str) -> (Claim<TimeUnit>, Vec<String>) {
+    let (claim, words) = split(name, TimeUnit::parse, |word| listed(LIKE_TIME, word));
+    // As in `timems`.
+    let glued = |word: &String| {
+        let rest = ["timestamp", "time", "t"].iter().find_map(|stem| word.strip_prefix(stem))?;
+        TimeUnit::parse(rest).filter(|_| rest != "s")
     };
-    RATES.contains(&stem.as_str()).then_some(axis)
+    match (&claim, words.len(), words.first().and_then(glued)) {
+        (Claim::Absent, 1, Some(unit)) => (Claim::Known(unit), vec!["time".to_owned()]),
+        _ => (claim, words),
+    }
+}
+
+fn rate_claim(name: &str) -> (Claim<RateUnit>, Vec<String>) {
+    split(name, RateUnit::parse, |word| LIKE_RATE.split(' ').any(|part| word.contains(part)))
+}
+
+/// Returns how well a name is that of a time stamp; 0 is best.
+fn stamp_rank(name: &str) -> Option<usize> {
+    let (claim, words) = time_claim(name);
+    let stem = words.concat();
+    let known = |rank: &usize| {
+        stem.is_empty() && *rank == 2 || listed(STAMPS[*rank], &stem) || (*rank == 0 && stem.ends_with("headerstamp"))
+    };
+    if stem.is_empty() && (claim == Claim::Absent || name.trim().len() < 2) {
+        return None;
+    }
+    (0..STAMPS.len()).find(known).or_else(|| {
+        let has = |list: &str| words.iter().any(|word| listed(list, word));
+        (has(STAMP_WORDS) && !has(NO_STAMP_WORDS)).then_some(STAMPS.len())
+    })
+}
+
+/// The axis in a name.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Axis {
+    Letter(usize),
+    /// An index, from 0 or from 1.
+    Number(usize),
+}
+
+/// Returns the axis, 0 to 2, that a word names.
+fn axis_of(word: &str) -> Option<usize> {
+    [["x", "roll"], ["y", "pitch"], ["z", "yaw"]].iter().position(|names| names.contains(&word))
+}
+
+/// The name of an angular velocity.
+#[derive(Debug, Clone, PartialEq)]
+struct RateName {
+    /// The rank of its likelihood; 0 is best.
+    rank: usize,
+    /// The name without axis and unit.
+    stem: String,
+    axis: Axis,
+}
+
+/// Takes a name for that of an angular velocity. `gyro` is true if the file's name says that it has nothing else.
+fn rate_name(name: &str, gyro: bool) -> Option<RateName> {
+    let (claim, mut words) = rate_claim(name);
+    if words.iter().any(|word| listed(NO_RATE_WORDS, word)) {
+        return None;
+    }
+    let digit = |word: &str| word.parse::<usize>().ok().filter(|digit| word.len() == 1 && *digit < 4);
+    // True for roll, pitch and yaw.
+    let mut turn = false;
+    let axis = if let Some((at, axis)) = (0..words.len()).rev().find_map(|at| Some((at, axis_of(&words[at])?))) {
+        turn = words.remove(at).len() > 1;
+        Axis::Letter(axis)
+    } else if let Some(index) = words.last().and_then(|last| digit(last)) {
+        words.pop();
+        Axis::Number(index)
+    } else {
+        // The begin or the end of a word, as in `wx`, `xgyro` and `omega1`.
+        let last = words.pop()?;
+        let before = words.concat();
+        let parts = ["x", "y", "z", "roll", "pitch", "yaw", "0", "1", "2", "3"].iter().flat_map(|part| {
+            let rests = [last.strip_suffix(part), last.strip_prefix(part).filter(|_| digit(part).is_none())];
+            rests.into_iter().flatten().map(move |rest| (*part, rest))
+        });
+        let found = parts.map(|(part, rest)| (part, before.clone() + rest));
+        let (part, stem) = found.into_iter().find(|(part, stem)| {
+            listed(RATES, stem)
+                || RATE_PARTS.split(' ').any(|part| stem.contains(part))
+                || (part.len() > 2 && stem == "speed")
+        })?;
+        turn = part.len() > 2;
+        words = vec![stem];
+        digit(part).map(Axis::Number).or_else(|| axis_of(part).map(Axis::Letter))?
+    };
+    words.retain(|word| word != "xyz");
+    let stem = words.concat();
+    let part = RATE_PARTS.split(' ').any(|part| stem.contains(part));
+    // An angle would have no time in its unit.
+    let per_second = ["/s", "ps", "s-1", "s^-1", "sec"].iter().any(|part| name.to_lowercase().contains(part));
+    let rank = if listed(RATES, &stem) || (turn && stem == "speed") {
+        0
+    } else if part || words.iter().any(|word| listed(RATE_WORDS, word)) {
+        1
+    } else if stem.is_empty() && !turn && (gyro || (per_second && matches!(claim, Claim::Known(_)))) {
+        2
+    } else {
+        return None;
+    };
+    Some(RateName { rank, stem, axis })
 }
 
 /// The positions of a log's columns.
 #[derive(Debug, Clone)]
 pub struct Places {
-    /// The column of stamps.
-    pub time: usize,
+    /// The column of stamps; `None` if the rows are counted.
+    pub time: Option<usize>,
+    /// The column with the rest of the stamp, and its unit.
+    pub time_part: Option<(usize, TimeUnit)>,
     /// The columns of the rates; `None` for a missing one.
     pub rates: [Option<usize>; 3],
     /// The column that separates segments.
@@ -92,97 +245,238 @@ pub struct Places {
     pub meaning: Meaning,
 }
 
-/// Finds the columns by the options and their names.
-pub fn find(names: &[String], path: &Path, options: &Options) -> Result<Places, DataError> {
-    let refuse = |reason: String, remedy: &str| {
-        let columns = names.iter().take(40).map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
-        let columns = if names.len() > 40 { format!("{columns}, …") } else { columns };
-        DataError::Column { path: path.to_owned(), reason, remedy: remedy.to_owned(), columns }
-    };
-    let named = |wanted: &str| {
-        let found: Vec<usize> = (0..names.len()).filter(|index| names[*index] == wanted).collect();
-        match found[..] {
-            [index] => Ok(index),
-            [] => Err(refuse(format!("there is no column `{wanted}`"), "name an existing one")),
-            _ => Err(refuse(format!("{} columns are called `{wanted}`", found.len()), "rename all but one")),
-        }
-    };
-    // In a file without header the names are numbers.
-    let numbers = names.iter().all(|name| name.parse::<f64>().is_ok());
-    let unnamed =
-        if options.header && numbers { "; if it has no header say so, and give columns by number" } else { "" };
-    let time = match &options.time {
-        Some(name) => named(name)?,
-        None => {
-            let found: Vec<usize> = (0..names.len()).filter(|index| is_stamp(&names[*index])).collect();
-            match found[..] {
-                [index] => index,
-                _ => {
-                    let count = if found.is_empty() { "no column is" } else { "more than one column is" };
-                    let remedy = format!("name the column of time{unnamed}");
-                    return Err(refuse(format!("{count} known to be time"), &remedy));
-                }
-            }
-        }
-    };
-    let rates = match &options.rates {
-        Some(given) => {
-            let mut rates = [None; 3];
-            for (rate, name) in rates.iter_mut().zip(given) {
-                *rate = if name == "-" { None } else { Some(named(name)?) };
-            }
-            rates
-        }
-        None => {
-            let mut rates = [None; 3];
-            for (axis, rate) in rates.iter_mut().enumerate() {
-                let found: Vec<usize> = (0..names.len()).filter(|i| rate_axis(&names[*i]) == Some(axis)).collect();
-                *rate = match found[..] {
-                    [] => None,
-                    [index] => Some(index),
-                    _ => {
-                        let both = format!("`{}` and `{}`", names[found[0]], names[found[1]]);
-                        return Err(refuse(
-                            format!("{both} may both be a rate"),
-                            "name the three columns of the rates",
-                        ));
-                    }
-                };
-            }
-            rates
-        }
-    };
-    for (axis, rate) in rates.iter().enumerate() {
-        if rate.is_none() && options.needed[axis] {
-            let letter = ["x", "y", "z"][axis];
-            let reason = format!("no column is known to be the rate about {letter}");
-            return Err(refuse(reason, &format!("name the three columns of the rates{unnamed}")));
-        }
-    }
-    let chosen: Vec<usize> = rates.iter().flatten().copied().chain([time]).collect();
+/// A search for columns.
+struct Search<'a> {
+    names: &'a [String],
+    path: &'a Path,
+    options: &'a Options,
+}
+
+/// Finds the columns by the options and their names. `first` returns the text of a column in the first row.
+pub fn find(
+    names: &[String],
+    path: &Path,
+    options: &Options,
+    first: impl Fn(usize) -> String,
+) -> Result<Places, DataError> {
+    let search = Search { names, path, options };
+    let by = options.by.as_deref().map(|name| search.named(name)).transpose()?;
+    let (time, time_part) = search.time()?;
+    let rates = search.rates()?;
+    let chosen: Vec<usize> = rates.iter().flatten().copied().chain(time).collect();
     if let Some(twice) = chosen.iter().enumerate().find_map(|(n, i)| chosen[..n].contains(i).then_some(*i)) {
-        return Err(refuse(format!("`{}` is named twice", names[twice]), "name each column once"));
+        return Err(search.refuse(format!("`{}` is named twice", names[twice]), "name each column once"));
     }
-    let by = options.by.as_deref().map(named).transpose()?;
-    let given_time = options.time_unit.or_else(|| time_unit(&names[time]));
-    let units: Vec<_> = rates.iter().flatten().map(|index| rate_unit(&names[*index])).collect();
-    let given_rate = match (options.rate_unit, units.first()) {
-        (Some(unit), _) => Some(unit),
-        (None, Some(first)) if units.iter().all(|unit| unit == first) => *first,
-        _ => {
-            return Err(refuse("the names of the rates tell different units".to_owned(), "tell the unit of all three"));
-        }
+    let stamp = time.map(first).unwrap_or_default();
+    let clock = Stamp::clock(&stamp).is_some();
+    let given_time = match time {
+        _ if options.time_unit.is_some() => options.time_unit,
+        _ if time_part.is_some() => Some(TimeUnit::Seconds),
+        _ if clock => Some(TimeUnit::Clock),
+        Some(column) => search.known(column, time_claim(&names[column]).0, "--time-unit s, ms, us or ns")?,
+        None => None,
     };
+    let given_rate = search.rate_unit(&rates)?;
     let name = |index: Option<usize>| index.map_or_else(|| "-".to_owned(), |index| names[index].clone());
     let mut assumed = Vec::new();
     assumed.extend(given_time.is_none().then_some("time"));
     assumed.extend(given_rate.is_none().then_some("rate"));
+    let time_name = time.map_or_else(|| "the row's number".to_owned(), |index| names[index].clone());
     let meaning = Meaning {
-        time: (name(Some(time)), given_time.unwrap_or(TimeUnit::Seconds)),
+        time: (time_name, given_time.or_else(|| since_1970(stamp.parse().ok()?)).unwrap_or(TimeUnit::Seconds)),
         rates: (rates.map(name), given_rate.unwrap_or(RateUnit::RadiansPerSecond)),
         assumed,
+        found: String::new(),
     };
-    Ok(Places { time, rates, by, meaning })
+    Ok(Places { time, time_part, rates, by, meaning })
+}
+
+impl Search<'_> {
+    fn refuse(&self, reason: String, remedy: &str) -> DataError {
+        let columns = self.names.iter().take(40).map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
+        let columns = if self.names.len() > 40 { format!("{columns}, …") } else { columns };
+        DataError::Column { path: self.path.to_owned(), reason, remedy: remedy.to_owned(), columns }
+    }
+
+    /// Returns the remedy for a log without header.
+    fn unnamed(&self) -> &'static str {
+        // In a file without header the names are numbers.
+        let numbers = self.names.iter().all(|name| name.parse::<f64>().is_ok());
+        if self.options.header && numbers { "; if it has no header say so, and give columns by number" } else { "" }
+    }
+
+    /// Returns the column with a name, in any case, or with a number from 1.
+    fn named(&self, wanted: &str) -> Result<usize, DataError> {
+        let all = |same: &dyn Fn(&str) -> bool| -> Vec<usize> {
+            (0..self.names.len()).filter(|index| same(&self.names[*index])).collect()
+        };
+        let mut found = all(&|name| name == wanted);
+        if found.is_empty() {
+            found = all(&|name| name.trim().to_lowercase() == wanted.trim().to_lowercase());
+        }
+        let number = wanted.parse::<usize>().ok().filter(|number| (1..=self.names.len()).contains(number));
+        match (&found[..], number) {
+            ([index], _) => Ok(*index),
+            ([], Some(number)) => Ok(number - 1),
+            ([], None) => {
+                let remedy = "name an existing one, or give its number";
+                Err(self.refuse(format!("there is no column `{wanted}`"), remedy))
+            }
+            _ => Err(self.refuse(format!("{} columns are called `{wanted}`", found.len()), "give its number")),
+        }
+    }
+
+    /// Returns the column of stamps, and that of their rest.
+    #[allow(clippy::type_complexity, reason = "it is taken apart at once")]
+    fn time(&self) -> Result<(Option<usize>, Option<(usize, TimeUnit)>), DataError> {
+        let given = self.options.time.as_deref().map(|name| self.named(name)).transpose()?;
+        let pairs: Vec<_> = (0..self.names.len()).filter_map(|index| self.stamp_part(index)).collect();
+        let pair = match (given, &pairs[..]) {
+            (Some(given), pairs) => pairs.iter().find(|(whole, ..)| *whole == given),
+            (None, [pair]) => Some(pair),
+            (None, _) => None,
+        };
+        if let Some((whole, part, unit)) = pair.filter(|_| self.options.time_unit.is_none()) {
+            return Ok((Some(*whole), Some((*part, *unit))));
+        }
+        if given.is_some() || matches!(self.options.time_unit, Some(TimeUnit::Count(_))) {
+            return Ok((given, None));
+        }
+        let ranked = || (0..self.names.len()).filter_map(|index| Some((stamp_rank(&self.names[index])?, index)));
+        let best = ranked().map(|(rank, _)| rank).min();
+        let of_best: Vec<usize> = ranked().filter(|(rank, _)| Some(*rank) == best).map(|(_, index)| index).collect();
+        let known = of_best.iter().find(|index| matches!(time_claim(&self.names[**index]).0, Claim::Known(_)));
+        match (&of_best[..], known) {
+            ([index], _) => Ok((Some(*index), None)),
+            // All of them are times; the unit of this one is certain.
+            (_, Some(index)) => Ok((Some(*index), None)),
+            _ => {
+                let count = if of_best.is_empty() { "no column is" } else { "more than one column is" };
+                let remedy = format!("name the column of time, or give the rows per second{}", self.unnamed());
+                Err(self.refuse(format!("{count} known to be time"), &remedy))
+            }
+        }
+    }
+
+    /// Returns the column of whole seconds that belongs to one of nanoseconds or microseconds, with this one and its unit.
+    fn stamp_part(&self, part: usize) -> Option<(usize, usize, TimeUnit)> {
+        let ends = |name: &str| {
+            let mut words = words(name);
+            let unit = TimeUnit::parse(&words.pop()?)?;
+            Some((words.concat(), unit))
+        };
+        let (stem, unit) = ends(&self.names[part])?;
+        let is_whole = |name: &String| ends(name) == Some((stem.clone(), TimeUnit::Seconds));
+        let whole = self.names.iter().position(is_whole)?;
+        let stamps = stem.is_empty() || ["stamp", "time", "tv", "t"].iter().any(|end| stem.ends_with(end));
+        let small = matches!(unit, TimeUnit::Nanoseconds | TimeUnit::Microseconds);
+        (small && stamps).then_some((whole, part, unit))
+    }
+
+    /// Returns the columns of the rates.
+    fn rates(&self) -> Result<[Option<usize>; 3], DataError> {
+        let mut rates = [None; 3];
+        if let Some(given) = &self.options.rates {
+            for (rate, name) in rates.iter_mut().zip(given) {
+                *rate = if name == "-" { None } else { Some(self.named(name)?) };
+            }
+        } else if let Some(found) = self.rates_by_name()? {
+            rates = found;
+        }
+        for (axis, rate) in rates.iter().enumerate() {
+            if rate.is_none() && self.options.needed[axis] {
+                let letter = ["x", "y", "z"][axis];
+                let reason = format!("no column is known to be the rate about {letter}");
+                return Err(self.refuse(reason, &format!("name the three columns of the rates{}", self.unnamed())));
+            }
+        }
+        Ok(rates)
+    }
+
+    /// Returns the best columns that their names give; `None` without any.
+    fn rates_by_name(&self) -> Result<Option<[Option<usize>; 3]>, DataError> {
+        let file = self.path.file_stem().map(|stem| stem.to_string_lossy().to_lowercase()).unwrap_or_default();
+        let gyro = file.contains("gyro") || file.contains("angular");
+        let named: Vec<(usize, RateName)> =
+            self.names.iter().enumerate().filter_map(|(index, name)| Some((index, rate_name(name, gyro)?))).collect();
+        let mut groups: Vec<(usize, [Option<usize>; 3])> = Vec::new();
+        for (_, first) in &named {
+            let group = || named.iter().filter(|(_, name)| name.stem == first.stem);
+            let has = |digit| group().any(|(_, name)| name.axis == Axis::Number(digit));
+            let mut columns = [None; 3];
+            for (index, name) in group() {
+                let axis = match name.axis {
+                    Axis::Letter(axis) => axis,
+                    // From 0 where 0 exists, from 1 where 3 does.
+                    Axis::Number(number) if has(0) && !has(3) => number,
+                    Axis::Number(number) if has(3) && !has(0) => number - 1,
+                    Axis::Number(_) => continue,
+                };
+                if let Some(earlier) = columns[axis].replace(*index) {
+                    return Err(self.both(earlier, *index));
+                }
+            }
+            if columns != [None; 3] && !groups.iter().any(|(_, known)| *known == columns) {
+                groups.push((first.rank, columns));
+            }
+        }
+        let complete = |columns: &[Option<usize>; 3]| columns.iter().all(Option::is_some);
+        let enough =
+            |columns: &[Option<usize>; 3]| (0..3).all(|axis| columns[axis].is_some() || !self.options.needed[axis]);
+        for wanted in [&complete as &dyn Fn(&[Option<usize>; 3]) -> bool, &enough, &|_| true] {
+            let fitting: Vec<_> = groups.iter().filter(|(_, columns)| wanted(columns)).collect();
+            let best = fitting.iter().map(|(rank, _)| rank).min();
+            let of_best: Vec<_> =
+                fitting.iter().filter(|(rank, _)| Some(rank) == best).map(|(_, columns)| columns).collect();
+            match of_best[..] {
+                [] => {}
+                [columns] => return Ok(Some(*columns)),
+                [first, second, ..] => {
+                    let some = |columns: &[Option<usize>; 3]| columns.iter().flatten().copied().next().unwrap_or(0);
+                    return Err(self.both(some(first), some(second)));
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    fn both(&self, first: usize, second: usize) -> DataError {
+        let reason = format!("`{}` and `{}` may both be a rate", self.names[first], self.names[second]);
+        self.refuse(reason, "name the three columns of the rates")
+    }
+
+    /// Returns the unit of the rates, if an option or their names give it.
+    fn rate_unit(&self, rates: &[Option<usize>; 3]) -> Result<Option<RateUnit>, DataError> {
+        if self.options.rate_unit.is_some() {
+            return Ok(self.options.rate_unit);
+        }
+        let mut units = Vec::new();
+        for index in rates.iter().flatten() {
+            let remedy = "--rate-unit rad/s, deg/s, mdps, mrad/s, rpm or rev/s, or --rate-scale and the rad/s per unit";
+            units.push(self.known(*index, rate_claim(&self.names[*index]).0, remedy)?);
+        }
+        match units.first() {
+            Some(first) if units.iter().all(|unit| unit == first) => Ok(*first),
+            None => Ok(None),
+            Some(_) => {
+                Err(self.refuse("the names of the rates tell different units".to_owned(), "tell the unit of all three"))
+            }
+        }
+    }
+
+    /// Returns a unit that is known.
+    fn known<U>(&self, column: usize, claim: Claim<U>, remedy: &'static str) -> Result<Option<U>, DataError> {
+        match claim {
+            Claim::Absent => Ok(None),
+            Claim::Known(unit) => Ok(Some(unit)),
+            Claim::Unknown(unit) => Err(DataError::UnknownUnit {
+                path: self.path.to_owned(),
+                column: self.names[column].clone(),
+                unit,
+                remedy,
+            }),
+        }
+    }
 }
 
 #[cfg(test)]
@@ -191,7 +485,7 @@ mod tests {
 
     fn found(names: &[&str], options: &Options) -> Result<Places, String> {
         let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
-        find(&names, "log.csv".as_ref(), options).map_err(|error| error.to_string())
+        find(&names, "log.csv".as_ref(), options, |_| String::new()).map_err(|error| error.to_string())
     }
 
     #[test]
@@ -210,12 +504,12 @@ mod tests {
             (["time_s", "omega_rad_s[0]", "omega_rad_s[1]", "omega_rad_s[2]"], Seconds, RadiansPerSecond),
         ] {
             let places = found(&names, &Options::default()).unwrap();
-            assert_eq!((places.time, places.rates), (0, [Some(1), Some(2), Some(3)]), "{names:?}");
+            assert_eq!((places.time, places.rates), (Some(0), [Some(1), Some(2), Some(3)]), "{names:?}");
             assert_eq!((places.meaning.time.1, places.meaning.rates.1), (time, rate), "{names:?}");
             assert!(places.meaning.assumed.is_empty(), "{names:?}");
         }
         let bare = found(&["wz", "t", "wx", "wy", "ax", "ay", "az"], &Options::default()).unwrap();
-        assert_eq!((bare.time, bare.rates), (1, [Some(2), Some(3), Some(0)]));
+        assert_eq!((bare.time, bare.rates), (Some(1), [Some(2), Some(3), Some(0)]));
         assert_eq!(bare.meaning.assumed, ["time", "rate"]);
     }
 
@@ -225,7 +519,9 @@ mod tests {
         let none = Options::default();
         assert!(refused(&["0.1", "1", "2", "3"], &none).contains("if it has no header say so"));
         assert!(refused(&["time", "wx", "wy"], &none).contains("about z; name the three columns"));
-        assert!(refused(&["time", "wx", "wy", "wz", "gyro_x"], &none).contains("`wx` and `gyro_x`"));
+        assert!(
+            refused(&["time", "wx", "wy", "wz", "gyro_x", "gyro_y", "gyro_z"], &none).contains("`wx` and `gyro_x`")
+        );
         assert!(refused(&["time", "t", "wx", "wy", "wz"], &none).contains("more than one column"));
         assert!(refused(&["time", "wx_dps", "wy_dps", "wz_rad_s"], &none).contains("different units"));
         let named = |time: &str, rates: [&str; 3]| Options {

@@ -1,93 +1,187 @@
-//! Reads rows of CSV. Must not hold more than one line in memory.
+//! Reads rows of a text table. Must not hold more than its begin and one line in memory.
 
 use super::columns::{self, Places};
-use super::form::{DataError, Meaning, Options, Row, Rows};
+use super::form::{DataError, Ending, Meaning, Options, Row, Rows};
 use super::stamp::Stamp;
+use super::table::{self, COMMENTS, Table};
+use super::unit::TimeUnit;
 use csv::{ByteRecord, ErrorKind, Reader, ReaderBuilder, Trim};
-use std::io::{self, Cursor, Read};
+use encoding_rs::{Encoding, UTF_16BE, UTF_16LE};
+use encoding_rs_io::DecodeReaderBytesBuilder;
+use std::fmt::Write;
+use std::io::{self, Chain, Cursor, Read};
 use std::path::{Path, PathBuf};
 
 /// The longest line, bytes.
 const LINE_BYTES: usize = 1 << 20;
-/// The part of the file in which the delimiter is detected, bytes.
+/// The part of the file in which the table is found, bytes.
 const PEEK_BYTES: usize = 64 << 10;
+/// The bytes that show an encoding.
+const MARK_BYTES: u64 = 4;
 /// The longest part of a cell shown in a message, characters.
 const SHOWN_LETTERS: usize = 40;
 /// The reason for refusing a line that is too long.
 const TOO_LONG: &str = "a line is longer than 1 MiB; name a CSV file";
 
-/// A reader of a CSV file.
+/// A reader of a text table.
 pub struct Csv {
     lines: Lines,
-    /// True while the current record is still to be read as a row: the first one of a file without header.
-    waiting: bool,
     cells: usize,
     places: Places,
+    rows: i64,
+    ending: Ending,
 }
+
+/// The text from the first row on.
+type Rest = Spaces<Chain<Cursor<Vec<u8>>, LineEnds<Box<dyn Read>>>>;
 
 /// The records of a file.
 struct Lines {
     path: PathBuf,
-    reader: Reader<Box<dyn Read>>,
+    reader: Reader<Rest>,
     record: ByteRecord,
+    /// The number of lines before the first row.
+    before: u64,
+    /// True if numbers may have a decimal comma.
+    comma: bool,
 }
 
 impl Csv {
-    /// Reads the header, or the first row.
+    /// Finds the table and its columns.
     pub fn new(mut source: Box<dyn Read>, path: &Path, options: &Options) -> Result<Self, DataError> {
+        let mut marks = Vec::new();
+        source.by_ref().take(MARK_BYTES).read_to_end(&mut marks).map_err(|source| read_error(path, 1, source))?;
+        let utf16 = utf16(&marks);
+        // It also removes a byte order mark, and leaves other bytes as they are.
+        let mut decoder = DecodeReaderBytesBuilder::new();
+        decoder.encoding(utf16).utf8_passthru(true).strip_bom(true).bom_sniffing(true);
+        let source: Box<dyn Read> = Box::new(decoder.build(Cursor::new(marks).chain(source)));
+        let mut source = LineEnds { source, length: 0, returned: false, unterminated: false, zeros: false };
         let mut start = Vec::new();
-        let failed = |source| DataError::Read { path: path.to_owned(), source };
+        let failed = |source| read_error(path, 1, source);
         source.by_ref().take(PEEK_BYTES as u64).read_to_end(&mut start).map_err(failed)?;
         let form = |reason: &str| DataError::Form { path: path.to_owned(), line: 1, reason: reason.to_owned() };
-        if start.starts_with(&[0xff, 0xfe]) || start.starts_with(&[0xfe, 0xff]) {
-            return Err(form("the file is UTF-16; save it as UTF-8"));
-        }
-        if start.contains(&0) {
+        if source.zeros && !start.contains(&b'\n') {
             return Err(form("the file is not text; name a CSV file"));
         }
-        if start.starts_with(b"\xef\xbb\xbf") {
-            // The byte order mark is not part of the first line.
-            start.drain(..3);
-        }
-        let delimiter = delimiter(&start);
-        let source: Box<dyn Read> =
-            Box::new(LineEnds { source: Cursor::new(start).chain(source), length: 0, returned: false });
+        let place =
+            |lines: u64| start.split_inclusive(|byte| *byte == b'\n').take(lines as usize).map(<[u8]>::len).sum();
+        let offset: usize = place(options.skip);
+        let (text, encoding) = decoded(&start[offset..]);
+        let Some(found) = table::find(&text) else { return Err(DataError::Empty { path: path.to_owned() }) };
+        let (places, header, cells) = places(&found, path, options)?;
+        // The place in the bytes: every line has as many as in the text.
+        let skipped = options.skip + found.lines;
+        let begin = place(skipped);
+        let rest = Cursor::new(start.split_off(begin)).chain(source);
+        let rest = Spaces { source: rest, joins: found.separator == b' ', last: b'\n' };
         let mut builder = ReaderBuilder::new();
-        builder.delimiter(delimiter).comment(Some(b'#')).trim(Trim::All).has_headers(false).flexible(true);
-        let reader = builder.from_reader(source);
-        let mut lines = Lines { path: path.to_owned(), reader, record: ByteRecord::new() };
-        if !lines.read()? {
-            return Err(DataError::Empty { path: path.to_owned() });
-        }
-        let name = |(index, cell): (usize, &[u8])| match options.header {
-            true => String::from_utf8_lossy(cell).into_owned(),
-            false => (index + 1).to_string(),
+        builder.delimiter(found.separator).comment(Some(b'#')).trim(Trim::All).has_headers(false).flexible(true);
+        let comma = found.separator != b',';
+        let lines = Lines {
+            path: path.to_owned(),
+            reader: builder.from_reader(rest),
+            record: ByteRecord::new(),
+            before: skipped,
+            comma,
         };
-        let names: Vec<String> = lines.record.iter().enumerate().map(name).collect();
-        let places = columns::find(&names, path, options)?;
-        Ok(Self { lines, waiting: !options.header, cells: names.len(), places })
+        let mut csv = Self { lines, cells, places, rows: 0, ending: Ending::default() };
+        let text = &mut csv.places.meaning.found;
+        match header {
+            Some(line) => write!(text, "header at line {}", options.skip + line),
+            None => write!(text, "no header"),
+        }
+        .and_then(|()| match found.separator {
+            b'\t' => write!(text, ", separated by tabs"),
+            b' ' => write!(text, ", separated by spaces"),
+            separator => write!(text, ", separator '{}'", char::from(separator)),
+        })
+        .expect("writing to a string does not fail");
+        if comma && found.first.iter().any(|cell| table::is_decimal_comma(cell)) {
+            text.push_str(", decimal comma");
+        }
+        text.push_str(if utf16.is_some() { ", UTF-16" } else { encoding });
+        Ok(csv)
+    }
+}
+
+/// Returns the kind of UTF-16 that a text is in: by its byte order mark, or by the zero bytes of digits and Latin letters.
+fn utf16(start: &[u8]) -> Option<&'static Encoding> {
+    match *start {
+        [0xff, 0xfe, ..] => Some(UTF_16LE),
+        [0xfe, 0xff, ..] => Some(UTF_16BE),
+        [first, 0, second, 0] if first != 0 && second != 0 => Some(UTF_16LE),
+        [0, first, 0, second] if first != 0 && second != 0 => Some(UTF_16BE),
+        _ => None,
+    }
+}
+
+/// Returns the text of bytes in UTF-8, else in Latin-1, of which the programs that write it mean its superset of Windows.
+fn decoded(bytes: &[u8]) -> (String, &'static str) {
+    match std::str::from_utf8(bytes) {
+        Ok(text) => (text.to_owned(), ""),
+        // The begin ends within a letter.
+        Err(error) if error.error_len().is_none() => {
+            (String::from_utf8_lossy(&bytes[..error.valid_up_to()]).into(), "")
+        }
+        Err(_) => (bytes.iter().map(|byte| char::from(*byte)).collect(), ", not UTF-8 and read as Latin-1"),
+    }
+}
+
+/// Returns the columns, the line of the header, and the number of cells of a row.
+fn places(found: &Table, path: &Path, options: &Options) -> Result<(Places, Option<u64>, usize), DataError> {
+    let first = |column: usize| found.first.get(column).cloned().unwrap_or_default();
+    let mut refusal = None;
+    if options.header {
+        for (line, names) in &found.headers {
+            match columns::find(names, path, options, first) {
+                Ok(places) => return Ok((places, Some(*line), names.len())),
+                // The first one is the most likely.
+                Err(error) => refusal = refusal.or(Some(error)),
+            }
+        }
+    }
+    let numbers: Vec<String> = (1..=found.first.len()).map(|number| number.to_string()).collect();
+    match (refusal, numbers.is_empty()) {
+        (Some(refusal), _) => Err(refusal),
+        (None, true) => Err(DataError::Empty { path: path.to_owned() }),
+        (None, false) => columns::find(&numbers, path, options, first).map(|places| (places, None, numbers.len())),
+    }
+}
+
+fn read_error(path: &Path, line: u64, source: io::Error) -> DataError {
+    let path = path.to_owned();
+    match source.to_string() == TOO_LONG {
+        true => DataError::Form { path, line, reason: TOO_LONG.to_owned() },
+        false => DataError::Read { path, source },
     }
 }
 
 impl Lines {
-    /// Reads the next record; returns false at the end.
+    /// Reads the next record that is not a comment; returns false at the end.
     fn read(&mut self) -> Result<bool, DataError> {
-        self.reader.read_byte_record(&mut self.record).map_err(|error| {
-            let (path, line) = (self.path.clone(), self.reader.position().line());
-            match error.into_kind() {
-                ErrorKind::Io(source) if source.to_string() == TOO_LONG => {
-                    DataError::Form { path, line, reason: TOO_LONG.to_owned() }
+        loop {
+            let read = self.reader.read_byte_record(&mut self.record).map_err(|error| {
+                let (path, line) = (&self.path, self.before + self.reader.position().line());
+                match error.into_kind() {
+                    ErrorKind::Io(source) => read_error(path, line, source),
+                    other => {
+                        let reason = format!("it cannot be read as CSV: {other:?}");
+                        DataError::Form { path: path.clone(), line, reason }
+                    }
                 }
-                ErrorKind::Io(source) => DataError::Read { path, source },
-                other => DataError::Form { path, line, reason: format!("it cannot be read as CSV: {other:?}") },
+            })?;
+            let comment = |mark: &&str| self.record.get(0).is_some_and(|cell| cell.starts_with(mark.as_bytes()));
+            if !read || !COMMENTS.iter().any(comment) {
+                return Ok(read);
             }
-        })
+        }
     }
 
     /// Returns the line on which the current record begins. The record's own position would be before skipped lines and comments.
     fn line(&self) -> u64 {
         let line_ends = self.record.as_slice().iter().filter(|byte| **byte == b'\n').count() as u64;
-        self.reader.position().line().saturating_sub(1 + line_ends)
+        (self.before + self.reader.position().line()).saturating_sub(1 + line_ends)
     }
 
     /// Returns a cell of the current record.
@@ -105,52 +199,70 @@ impl Lines {
 
     /// Reads a number; `None` if it is unknown.
     fn number(&self, column: usize, name: &str) -> Result<Option<f64>, DataError> {
-        let cell = self.cell(column);
-        if let Some(value) = std::str::from_utf8(cell).ok().and_then(|text| text.parse::<f64>().ok()) {
-            return match value {
-                value if value.is_nan() => Ok(None),
-                value if value.is_infinite() => {
-                    Err(self.no_number(column, name, "is not finite; leave unknown values empty"))
-                }
-                value => Ok(Some(value)),
-            };
-        }
-        match cell {
-            b"" | b"NA" | b"N/A" | b"na" | b"n/a" | b"null" | b"NULL" | b"None" => Ok(None),
-            _ if is_decimal_comma(cell) => {
-                Err(self.no_number(column, name, "has a decimal comma; write its numbers with a point"))
+        let cell = std::str::from_utf8(self.cell(column)).unwrap_or("\u{fffd}");
+        match table::number(cell, self.comma) {
+            Some(value) if value.is_nan() => Ok(None),
+            Some(value) if value.is_infinite() => {
+                Err(self.no_number(column, name, "is not finite; leave unknown values empty"))
             }
-            _ => Err(self.no_number(column, name, "is not a number; correct it, or leave the cell empty")),
+            Some(value) => Ok(Some(value)),
+            None if table::is_unknown(cell) => Ok(None),
+            None if table::is_decimal_comma(cell) => {
+                Err(self.no_number(column, name, "has a decimal comma; separate the cells by semicolons or tabs"))
+            }
+            None => Err(self.no_number(column, name, "is not a number; correct it, or leave the cell empty")),
         }
     }
 
     /// Reads a stamp; `None` if it is unknown.
-    fn stamp(&self, column: usize, meaning: &Meaning) -> Result<Option<Stamp>, DataError> {
-        let (name, unit) = &meaning.time;
-        if let Some(stamp) = std::str::from_utf8(self.cell(column)).ok().and_then(|text| Stamp::digits(text, *unit)) {
+    fn stamp(&self, column: usize, name: &str, unit: TimeUnit) -> Result<Option<Stamp>, DataError> {
+        let text = std::str::from_utf8(self.cell(column)).unwrap_or("\u{fffd}");
+        // A header that is repeated has no value.
+        if table::is_unknown(text) || text == name {
+            return Ok(None);
+        }
+        if unit == TimeUnit::Clock {
+            let stamp = Stamp::clock(text);
+            let reason = "is not a time of day as in the first row; correct it, or leave the cell empty";
+            return stamp.map(Some).ok_or_else(|| self.no_number(column, name, reason));
+        }
+        let point = if self.comma { text.replacen(',', ".", 1) } else { text.to_owned() };
+        if let Some(stamp) = Stamp::digits(&point, unit) {
             return Ok(Some(stamp));
         }
         let Some(value) = self.number(column, name)? else { return Ok(None) };
-        let stamp = Stamp::float(value, *unit);
+        let stamp = Stamp::float(value, unit);
         stamp.map(Some).ok_or_else(|| self.no_number(column, name, "is out of the range of time stamps; correct it"))
+    }
+
+    /// Returns true if no record follows, and the text ends without a line end.
+    fn is_half_written(&mut self) -> bool {
+        let read = self.reader.read_byte_record(&mut self.record);
+        read.is_ok_and(|read| !read) && self.reader.get_ref().source.get_ref().1.unterminated
     }
 }
 
-impl Rows for Csv {
-    fn read(&mut self, row: &mut Row) -> Result<bool, DataError> {
-        if !std::mem::take(&mut self.waiting) && !self.lines.read()? {
-            return Ok(false);
-        }
+impl Csv {
+    /// Reads the current record into a row.
+    fn take(&mut self, row: &mut Row) -> Result<(), DataError> {
         let Self { lines, cells, places, .. } = self;
-        if lines.record.len() != *cells {
+        let extra = lines.record.iter().skip(*cells).all(<[u8]>::is_empty);
+        if lines.record.len() < *cells || !extra {
             let (path, found) = (lines.path.clone(), lines.record.len());
             return Err(DataError::Cells { path, line: lines.line(), found, expected: *cells });
         }
         row.number = lines.line();
-        row.stamp = lines.stamp(places.time, &places.meaning)?;
+        let (name, unit) = &places.meaning.time;
+        row.stamp = match places.time {
+            Some(column) => lines.stamp(column, name, *unit)?,
+            None => Some(Stamp::whole(self.rows, *unit)),
+        };
+        if let (Some((column, unit)), Some(stamp)) = (places.time_part, row.stamp) {
+            row.stamp = lines.stamp(column, "", unit)?.map(|part| stamp.plus(&part));
+        }
         let (names, unit) = &places.meaning.rates;
         for (axis, rate) in row.rate_rad_s.iter_mut().enumerate() {
-            *rate = match places.rates[axis] {
+            *rate = match places.rates[axis].filter(|_| row.stamp.is_some()) {
                 Some(column) => lines.number(column, &names[axis])?.map_or(f64::NAN, |value| value * unit.rad_s()),
                 None => f64::NAN,
             };
@@ -159,43 +271,90 @@ impl Rows for Csv {
         if let Some(column) = places.by {
             row.key.extend_from_slice(lines.cell(column));
         }
-        Ok(true)
+        Ok(())
+    }
+}
+
+impl Rows for Csv {
+    fn read(&mut self, row: &mut Row) -> Result<bool, DataError> {
+        if !self.lines.read()? {
+            self.ending.zeros = self.lines.reader.get_ref().source.get_ref().1.zeros;
+            return Ok(false);
+        }
+        match self.take(row) {
+            Err(error) if !self.lines.is_half_written() => Err(error),
+            Err(_) => {
+                self.ending = Ending { half: true, zeros: self.lines.reader.get_ref().source.get_ref().1.zeros };
+                Ok(false)
+            }
+            Ok(()) => {
+                self.rows += 1;
+                Ok(true)
+            }
+        }
     }
 
     fn meaning(&self) -> &Meaning {
         &self.places.meaning
     }
+
+    fn ending(&self) -> Ending {
+        self.ending
+    }
 }
 
-/// Detects the delimiter: the most frequent of comma, semicolon and tab in the first line other than a comment.
-fn delimiter(start: &[u8]) -> u8 {
-    let mut lines = start.split(|byte| matches!(byte, b'\n' | b'\r'));
-    let first = lines.find(|line| !line.is_empty() && line[0] != b'#').unwrap_or_default();
-    let count = |delimiter: &u8| first.iter().filter(|byte| *byte == delimiter).count();
-    // Among equal counts, `max_by_key` takes the last.
-    [b'\t', b';', b','].into_iter().max_by_key(count).unwrap_or(b',')
+/// A reader that joins runs of spaces and tabs, if they separate the cells.
+struct Spaces<R> {
+    source: R,
+    joins: bool,
+    last: u8,
 }
 
-/// Returns true if a cell is a number with a decimal comma.
-fn is_decimal_comma(cell: &[u8]) -> bool {
-    let text = String::from_utf8_lossy(cell);
-    text.matches(',').count() == 1 && text.replace(',', ".").parse::<f64>().is_ok()
+impl<R: Read> Read for Spaces<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        loop {
+            let read = self.source.read(buffer)?;
+            if !self.joins || read == 0 {
+                return Ok(read);
+            }
+            let mut count = 0;
+            for index in 0..read {
+                let byte = if buffer[index] == b'\t' { b' ' } else { buffer[index] };
+                if byte != b' ' || !matches!(self.last, b' ' | b'\n') {
+                    buffer[count] = byte;
+                    count += 1;
+                }
+                self.last = byte;
+            }
+            if count > 0 {
+                return Ok(count);
+            }
+        }
+    }
 }
 
-/// A reader that ends every line with `\n`, including the last, and refuses lines that are too long: a source without line ends
-/// must not fill the memory.
+/// A reader that ends every line with `\n`, including the last, ends at a zero byte, and refuses lines that are too long: a
+/// source without line ends must not fill the memory.
 struct LineEnds<R> {
     source: R,
     /// The bytes since the last line end.
     length: usize,
     /// True if the last byte was a carriage return, which has already become a line end.
     returned: bool,
+    /// True if the source ended within a line.
+    unterminated: bool,
+    /// True if the text ended at a zero byte.
+    zeros: bool,
 }
 
 impl<R: Read> Read for LineEnds<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         loop {
-            let read = self.source.read(buffer)?;
+            let mut read = if self.zeros || self.unterminated { 0 } else { self.source.read(buffer)? };
+            if let Some(zero) = buffer[..read].iter().position(|byte| *byte == 0) {
+                // A logger that lost its power leaves them in place of what it had not written.
+                (self.zeros, read) = (true, zero);
+            }
             if read == 0 {
                 return Ok(self.last_end(buffer));
             }
@@ -218,7 +377,7 @@ impl<R> LineEnds<R> {
     fn last_end(&mut self, buffer: &mut [u8]) -> usize {
         match buffer.first_mut() {
             Some(first) if self.length > 0 => {
-                (*first, self.length) = (b'\n', 0);
+                (*first, self.length, self.unterminated) = (b'\n', 0, true);
                 1
             }
             _ => 0,

@@ -2,13 +2,15 @@
 //!
 //! It reads ahead the samples from which it chooses the rate; beyond that, memory grows only with the number of segments.
 
+use super::cut::resolved;
 use super::form::{DataError, Options};
 use super::identification::{LogAccount, sample};
 use super::log::{Entry, Log};
+use super::plausible;
 use crate::estimate::{
     FilterKind, RateChoice, RateSurvey, Reconstructed, Reconstruction, ReconstructionError, Score, SegmentScore, Setup,
 };
-use crate::identify::Sample;
+use crate::identify::{Motion, Sample};
 use nalgebra::{Matrix3, Vector3};
 use std::path::Path;
 
@@ -21,6 +23,10 @@ const LEAST_FLOOR_RAD_S: f64 = 1e-6;
 const UNMIXED: f64 = 1e-9;
 /// The largest deviation of a rotation matrix from orthogonality.
 const ROTATION: f64 = 1e-3;
+/// The turn in a step from which it is too long, rad.
+const LONG_TURN_RAD: f64 = 1.5;
+/// An estimate above this multiple of the fastest measured rate has diverged.
+const DIVERGED: f64 = 1e3;
 
 /// The kind of filter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -122,6 +128,8 @@ pub struct Estimation {
     pub choice: Option<RateChoice>,
     /// True if the filter uses the chosen rate.
     pub chosen: bool,
+    /// The number of samples at which the estimate is not finite, or a thousand times the fastest measured rate.
+    pub diverged: u64,
     /// The segments with their names and scores, in the order of the log.
     pub segments: Vec<(String, SegmentScore)>,
 }
@@ -149,7 +157,7 @@ pub fn estimate_log(
     if let Some(sensor) = (0..3).filter(|sensor| needed[*sensor]).find(absent).filter(|_| request.axes.is_some()) {
         return Err(EstimateError::Mixed { axis: ["x", "y", "z"][sensor] });
     }
-    let mut log = Log::open(path, &options)?;
+    let mut log = Log::open(path, &resolved(path, &options)?)?;
     let principal = |entry: &Entry| {
         let measured = Vector3::from(entry.rate_rad_s);
         if request.axes.is_none() {
@@ -175,15 +183,28 @@ pub fn estimate_log(
         floor_rad_s,
     })?;
     let (mut score, mut segments, mut name) = (Score::default(), Vec::new(), String::new());
+    let (mut fastest_rad_s, mut begun, mut diverged, mut last_s) = (0.0_f64, false, 0, 0.0);
     let mut take = |entry: &Entry, named: &str| -> Result<(), EstimateError> {
         if entry.begins {
             segments.extend(score.end_segment().map(|score| (name.clone(), score)));
             reconstruction.end_segment();
+            begun = false;
             named.clone_into(&mut name);
         }
         let principal_rad_s = principal(entry);
-        let reconstructed = reconstruction.push(&Sample { time_s: entry.time_s, rate_rad_s: principal_rad_s });
-        score.push(reconstructed.rate_rad_s, principal_rad_s[hidden], reconstructed.observed);
+        let mut reconstructed = reconstruction.push(&Sample { time_s: entry.time_s, rate_rad_s: principal_rad_s });
+        let known = principal_rad_s.iter().filter(|rate| rate.is_finite()).map(|rate| rate * rate).sum::<f64>();
+        let turn_rad = known.sqrt() * (entry.time_s - last_s);
+        // Where steps turn so far, the differences that give noise and floor are motion.
+        reconstructed.too_long |= !reconstructed.observed && !entry.begins && turn_rad > LONG_TURN_RAD;
+        last_s = entry.time_s;
+        score.push(&reconstructed, principal_rad_s[hidden]);
+        let rates = principal_rad_s.iter().filter(|rate| rate.is_finite());
+        fastest_rad_s = rates.fold(fastest_rad_s, |fastest, rate| fastest.max(rate.abs()));
+        begun |= reconstructed.observed;
+        // False for NaN.
+        let near = reconstructed.rate_rad_s.abs() <= DIVERGED * fastest_rad_s;
+        diverged += u64::from(begun && !near && !entry.begins);
         each(&Estimated { entry: *entry, principal_rad_s, estimate: reconstructed }, &name).map_err(EstimateError::Sink)
     };
     let mut names = String::new();
@@ -201,8 +222,16 @@ pub fn estimate_log(
         take(&entry, &names)?;
     }
     segments.extend(score.end_segment().map(|score| (name, score)));
-    let account = LogAccount { path: path.to_owned(), meaning: log.meaning().clone(), counts: *log.counts() };
-    Ok(Estimation { log: account, filter, floor_rad_s, choice, chosen: request.decay_per_s.is_none(), segments })
+    let account = LogAccount { path: path.to_owned(), ..LogAccount::new(&log) };
+    Ok(Estimation {
+        log: account,
+        filter,
+        floor_rad_s,
+        choice,
+        chosen: request.decay_per_s.is_none(),
+        diverged,
+        segments,
+    })
 }
 
 /// Reads a log's start, with the name of each segment that begins there.
@@ -213,14 +242,21 @@ fn survey(
     principal: impl Fn(&Entry) -> Vector3<f64>,
 ) -> Result<(Vec<(Entry, Option<String>)>, RateSurvey), EstimateError> {
     let (mut head, mut survey) = (Vec::new(), RateSurvey::new(&request.coefficients, request.axis));
+    let mut motion = Motion::default();
     while head.len() < SURVEY_SAMPLES {
         let Some(entry) = log.next().transpose()? else { break };
         if entry.begins {
             survey.end_segment();
+            motion.end_segment();
+        }
+        if entry.rate_rad_s.iter().all(|rate| rate.is_finite()) {
+            motion.push(&sample(&entry));
         }
         survey.push(&Sample { rate_rad_s: principal(&entry), ..sample(&entry) });
         head.push((entry, entry.begins.then(|| log.segment_name())));
     }
+    motion.end_segment();
+    plausible::check_scale(log.path(), log.meaning(), &motion)?;
     Ok((head, survey))
 }
 

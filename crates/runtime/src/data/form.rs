@@ -29,11 +29,11 @@ use std::path::PathBuf;
 pub struct Options {
     /// The topic of an MCAP file, or the end of its name. MCAP needs no column names or units.
     pub topic: Option<String>,
-    /// The column of time stamps, by name, or by number from 1 without a header.
+    /// The column of time stamps, by name or by number from 1.
     pub time: Option<String>,
     /// The columns of the three rates; `-` for a missing one.
     pub rates: Option<[String; 3]>,
-    /// The unit of the stamps.
+    /// The unit of the stamps. With [`TimeUnit::Count`] and no column, the rows are counted.
     pub time_unit: Option<TimeUnit>,
     /// The unit of the rates.
     pub rate_unit: Option<RateUnit>,
@@ -41,10 +41,26 @@ pub struct Options {
     pub by: Option<String>,
     /// A longer pause begins a new segment, s.
     pub gap_s: Option<f64>,
-    /// True if the first row holds the column names.
+    /// True if the columns have names; else they are called by number.
     pub header: bool,
+    /// The number of lines before the table, apart from those that the reader leaves out by itself.
+    pub skip: u64,
     /// The rates that a row must have; other rows are left out.
     pub needed: [bool; 3],
+    /// The parts of the log that are read.
+    pub cut: Cut,
+}
+
+/// The parts of a log that are read; each is a segment.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub enum Cut {
+    /// All of it.
+    #[default]
+    Whole,
+    /// Between times since the log's first row, s.
+    Between(Vec<[f64; 2]>),
+    /// The stretches in which one body moves freely: found by `identify_logs` and `estimate_log`.
+    Free,
 }
 
 impl Default for Options {
@@ -58,7 +74,9 @@ impl Default for Options {
             by: None,
             gap_s: None,
             header: true,
+            skip: 0,
             needed: [true; 3],
+            cut: Cut::Whole,
         }
     }
 }
@@ -138,19 +156,37 @@ pub enum DataError {
         /// The mistake, and the remedy.
         reason: String,
     },
-    /// The assumed unit of time gives an implausible interval.
-    #[error(
-        "{}: the usual interval is {interval_s} s if the stamps are in {unit}, as assumed; say what they are in with a unit of \
-         time (s, ms, us, ns)", path.display()
-    )]
+    /// An assumed unit is impossible.
+    #[error("{}: {reason}, with {assumed}; {likely}", path.display())]
     #[strum(serialize = "implausible-unit")]
     Unit {
         /// The file.
         path: PathBuf,
-        /// The usual interval, s.
-        interval_s: f64,
-        /// The assumed unit.
-        unit: TimeUnit,
+        /// The contradiction.
+        reason: String,
+        /// The assumed units.
+        assumed: String,
+        /// The likely units, and the options for them.
+        likely: String,
+    },
+    /// A column's name has a unit that is not known.
+    #[error("{}: column `{column}`: `{unit}` is not a known unit; give {remedy}", path.display())]
+    UnknownUnit {
+        /// The file.
+        path: PathBuf,
+        /// The column.
+        column: String,
+        /// The text in place of a unit.
+        unit: String,
+        /// The option that replaces it.
+        remedy: &'static str,
+    },
+    /// No free motion is found.
+    #[error("{}: no stretch of it is the free motion of one body; cut it with --from and --to, or --segments", path.display())]
+    #[strum(serialize = "not-free")]
+    NotFree {
+        /// The file.
+        path: PathBuf,
     },
     /// An option has an invalid value.
     #[error("{name}: {reason}")]
@@ -172,6 +208,19 @@ pub struct Meaning {
     pub rates: ([String; 3], RateUnit),
     /// The units that were assumed, because neither a name nor an option gives them.
     pub assumed: Vec<&'static str>,
+    /// The form of the table, such as its separator.
+    pub found: String,
+}
+
+impl Meaning {
+    /// Returns the assumed units as text; `None` if all are given.
+    pub fn assumed_text(&self) -> Option<String> {
+        let units = self.assumed.iter().map(|what| match *what {
+            "time" => format!("{} in {}", self.time.0, self.time.1),
+            _ => format!("{} in {}", self.rates.0.join(", "), self.rates.1),
+        });
+        (!self.assumed.is_empty()).then(|| format!("{}, as assumed", units.collect::<Vec<_>>().join(" and ")))
+    }
 }
 
 /// One row of the file, in SI units.
@@ -185,6 +234,15 @@ pub(super) struct Row {
     pub key: Vec<u8>,
 }
 
+/// The end of a file.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Ending {
+    /// True if the last row is half-written.
+    pub half: bool,
+    /// True if zero bytes follow the text.
+    pub zeros: bool,
+}
+
 /// A reader of one file format.
 pub(super) trait Rows {
     /// Reads the next row into `row`; returns false at the end.
@@ -192,4 +250,9 @@ pub(super) trait Rows {
 
     /// Returns the meaning of the columns.
     fn meaning(&self) -> &Meaning;
+
+    /// Returns how the file ended, once it has.
+    fn ending(&self) -> Ending {
+        Ending::default()
+    }
 }

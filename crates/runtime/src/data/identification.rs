@@ -1,7 +1,9 @@
 //! Identifies a body from logs: runs every method of [`identify`](crate::identify) along the rows, in bounded memory.
 
+use super::cut::resolved;
 use super::form::{DataError, Meaning, Options};
 use super::log::{Counts, Entry, Log};
+use super::plausible;
 use crate::identify::{
     AxesFit, Finding, Motion, MotionSummary, RecursiveAxisymmetricIdentifier, RecursiveFit, RecursiveIdentifier,
     Sample, TensorFit, findings,
@@ -28,6 +30,16 @@ pub struct LogAccount {
     pub meaning: Meaning,
     /// The counts of its rows.
     pub counts: Counts,
+    /// The parts that were read, s since the first row; `None` for all.
+    pub parts: Option<Vec<[f64; 2]>>,
+}
+
+impl LogAccount {
+    /// Returns the account of a log that was read to its end.
+    pub(super) fn new(log: &Log) -> Self {
+        let parts = log.parts().map(<[_]>::to_vec);
+        Self { path: log.path().to_owned(), meaning: log.meaning().clone(), counts: *log.counts(), parts }
+    }
 }
 
 /// The result of an identification.
@@ -64,8 +76,10 @@ pub fn identify_logs(paths: &[PathBuf], options: &Options, ways: &Ways) -> Resul
     let mut motion = Motion::default();
     let mut recursive = Filters::new(ways, 0.0)?;
     let mut logs = Vec::new();
-    for path in paths {
-        logs.push(read(path, &all, |step| match step {
+    // The free motion of each log is found once.
+    let found = paths.iter().map(|path| resolved(path, &all)).collect::<Result<Vec<_>, _>>()?;
+    for (path, all) in paths.iter().zip(&found) {
+        logs.push(read(path, all, |step| match step {
             Step::Sample(sample) => {
                 motion.push(sample);
                 if !rereadable {
@@ -79,22 +93,24 @@ pub fn identify_logs(paths: &[PathBuf], options: &Options, ways: &Ways) -> Resul
         })?);
     }
     let (axes, body) = (motion.about_known_axes(ways.damping), motion.moments_about_known_axes(ways.damping));
+    let tensor = motion.about_unknown_axes(ways.damping);
+    let findings = findings(&motion, axes.as_ref(), body.as_ref(), tensor.as_ref());
+    logs.iter().try_for_each(|log| plausible::check_scale(&log.path, &log.meaning, &motion))?;
     let mut recursive_damping_per_s = 0.0;
     if rereadable {
         recursive_damping_per_s = body.map_or(0.0, |fit| fit.damping_per_s);
         recursive = Filters::new(ways, recursive_damping_per_s)?;
-        for path in paths {
-            read(path, &all, |step| match step {
+        for (path, all) in paths.iter().zip(&found) {
+            read(path, all, |step| match step {
                 Step::Sample(sample) => recursive.push(sample),
                 Step::End => recursive.end_segment(),
             })?;
         }
     }
-    let tensor = motion.about_unknown_axes(ways.damping);
     Ok(Identified {
         logs,
         account: *motion.summary(),
-        findings: findings(&motion, axes.as_ref(), tensor.as_ref()),
+        findings,
         axes,
         body,
         tensor,
@@ -160,5 +176,5 @@ fn read(path: &Path, options: &Options, mut each: impl FnMut(Step<'_>)) -> Resul
         each(Step::Sample(&sample(&entry)));
     }
     each(Step::End);
-    Ok(LogAccount { path: log.path().to_owned(), meaning: log.meaning().clone(), counts: *log.counts() })
+    Ok(LogAccount::new(&log))
 }

@@ -1,10 +1,11 @@
 //! Reads a log row by row: detects the file format, leaves out unusable rows, and splits it into segments.
 
-use super::form::{DataError, Meaning, Options, Row, Rows};
+use super::form::{Cut, DataError, Meaning, Options, Row, Rows};
 #[cfg(feature = "parquet")]
 use super::parquet;
+use super::plausible::Plausible;
 use super::stamp::Stamp;
-use super::{csv, mcap};
+use super::{csv, mcap, packed};
 use crate::telemetry::{quantile, sorted};
 use std::collections::VecDeque;
 use std::fs::File;
@@ -15,8 +16,6 @@ use std::path::{Path, PathBuf};
 const HEAD_ROWS: usize = 256;
 /// A pause longer than this multiple of the usual interval is a gap, unless `gap_s` is given.
 const GAP_INTERVALS: f64 = 5.0;
-/// The longest plausible usual interval, s. One above it, or below its inverse in ms, suggests another unit of time.
-const LONGEST_INTERVAL_S: f64 = 100.0;
 
 /// A row of a log.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,6 +47,16 @@ pub struct Counts {
     pub backward: u64,
     /// Gaps in time; each begins a new segment.
     pub gaps: u64,
+    /// 1 if the last row is half-written and left out.
+    pub half_written: u64,
+    /// 1 if the text ends at zero bytes.
+    pub zero_tail: u64,
+    /// Rows left out because they are outside the parts that are read.
+    pub outside: u64,
+    /// The time in segments, s.
+    pub used_s: f64,
+    /// The time from the first row to the last, s.
+    pub whole_s: f64,
     /// Number of segments.
     pub segments: u64,
     /// The shortest and the longest interval within a segment, s.
@@ -60,6 +69,10 @@ pub struct Log {
     rows: Box<dyn Rows>,
     needed: [bool; 3],
     gap_s: f64,
+    plausible: Plausible,
+    /// The parts that are read, and that of the last used row.
+    parts: Option<Vec<[f64; 2]>>,
+    part: usize,
     /// The rows read ahead.
     head: VecDeque<Row>,
     row: Row,
@@ -88,11 +101,21 @@ impl Log {
         }
         // A pipe cannot be read twice.
         if about.is_file() {
-            let mut start = Vec::new();
-            file.by_ref().take(8).read_to_end(&mut start).map_err(failed)?;
-            file.rewind().map_err(failed)?;
+            let peek = |file: &mut File| -> io::Result<Vec<u8>> {
+                let mut start = Vec::new();
+                file.by_ref().take(packed::START_BYTES).read_to_end(&mut start)?;
+                file.rewind().map(|()| start)
+            };
+            let mut start = peek(&mut file).map_err(failed)?;
+            if let Some(unpacked) = packed::unpacked(&start, &mut file).map_err(failed)? {
+                file = unpacked;
+                start = peek(&mut file).map_err(failed)?;
+            }
+            if let Some(error) = packed::foreign(&start, path) {
+                return Err(error);
+            }
             if mcap::Mcap::is_begun(&start) {
-                return Self::new(Box::new(mcap::Mcap::new(file, path, options)), path, options);
+                return Self::new(Box::new(mcap::Mcap::new(file, path, options)?), path, options);
             }
             #[cfg(feature = "parquet")]
             if parquet::ParquetLog::is_begun(&start) {
@@ -107,10 +130,10 @@ impl Log {
         Self::from_csv(file, path, options)
     }
 
-    /// Reads CSV from any source; `path` is its name in messages.
+    /// Reads a table as text from any source; `path` is its name in messages.
     ///
-    /// The delimiter is comma, semicolon or tab: the most frequent one in the first line. Lines that begin with `#` are comments.
-    /// An empty cell, NaN, NA or null is an unknown value.
+    /// The separator, the header and the first row are found, see [`Meaning::found`]. Lines that begin with `#`, `%` or `//` are
+    /// comments. An empty cell, NaN, NA or null is an unknown value.
     ///
     /// # Errors
     /// [`DataError`].
@@ -122,6 +145,10 @@ impl Log {
         if let Some(gap_s) = options.gap_s.filter(|gap_s| !(gap_s.is_finite() && *gap_s > 0.0)) {
             let reason = format!("a pause of {gap_s} s is out of range; give a number above 0");
             return Err(DataError::Option { name: "gap", reason });
+        }
+        if options.cut == Cut::Free {
+            let reason = "the free motion is found before a log is read; give its times".to_owned();
+            return Err(DataError::Option { name: "find free", reason });
         }
         let mut head = VecDeque::new();
         while head.len() < HEAD_ROWS {
@@ -135,19 +162,21 @@ impl Log {
             return Err(DataError::Empty { path: path.to_owned() });
         }
         let usual_s = usual_interval_s(&head);
-        let meaning = rows.meaning();
-        if let Some(interval_s) = usual_s.filter(|usual_s| {
-            meaning.assumed.contains(&"time") && !(1e-3 / LONGEST_INTERVAL_S..LONGEST_INTERVAL_S).contains(usual_s)
-        }) {
-            return Err(DataError::Unit { path: path.to_owned(), interval_s, unit: meaning.time.1 });
-        }
+        let first = head.iter().find_map(|row| row.stamp);
+        let plausible = Plausible::new(path, rows.meaning(), usual_s, first.as_ref())?;
         let gap_s = options.gap_s.or(usual_s.map(|usual_s| GAP_INTERVALS * usual_s)).unwrap_or(f64::INFINITY);
         Ok(Self {
             path: path.to_owned(),
             rows,
             needed: options.needed,
             gap_s,
-            first: head.iter().find_map(|row| row.stamp),
+            first,
+            plausible,
+            parts: match &options.cut {
+                Cut::Between(parts) => Some(parts.clone()),
+                Cut::Whole | Cut::Free => None,
+            },
+            part: 0,
             head,
             row: Row::default(),
             last_time_s: f64::NAN,
@@ -172,6 +201,11 @@ impl Log {
         self.gap_s
     }
 
+    /// Returns the parts that are read, s since the first row; `None` for all.
+    pub fn parts(&self) -> Option<&[[f64; 2]]> {
+        self.parts.as_deref()
+    }
+
     /// Returns the counts of the rows read so far.
     pub fn counts(&self) -> &Counts {
         &self.counts
@@ -191,11 +225,20 @@ impl Log {
             match self.head.pop_front() {
                 Some(row) => self.row = row,
                 None if self.rows.read(&mut self.row)? => {}
-                None => return Ok(None),
+                None => {
+                    let ending = self.rows.ending();
+                    self.counts.half_written = u64::from(ending.half);
+                    self.counts.zero_tail = u64::from(ending.zeros);
+                    return Ok(None);
+                }
             }
             self.counts.rows += 1;
             if let Some(entry) = self.take() {
-                return Ok(Some(entry));
+                let checked = self.plausible.check(&self.path, self.rows.meaning(), entry.row, entry.rate_rad_s);
+                // Like any row with an error, it is not counted.
+                self.counts.rows -= u64::from(checked.is_err());
+                self.counts.used -= u64::from(checked.is_err());
+                return checked.map(|()| Some(entry));
             }
         }
     }
@@ -209,8 +252,18 @@ impl Log {
             return None;
         };
         let time_s = stamp.since_s(self.first.get_or_insert(stamp));
+        self.counts.whole_s = self.counts.whole_s.max(time_s);
+        let mut new_part = false;
+        if let Some(parts) = &self.parts {
+            let Some(part) = parts.iter().position(|[begin, end]| (*begin..=*end).contains(&time_s)) else {
+                self.counts.outside += 1;
+                return None;
+            };
+            new_part = part != self.part;
+            self.part = part;
+        }
         let interval_s = time_s - self.last_time_s;
-        let new_key = self.counts.used == 0 || self.row.key != self.last_key;
+        let new_key = self.counts.used == 0 || new_part || self.row.key != self.last_key;
         if !new_key && interval_s == 0.0 {
             self.counts.repeated += 1;
             return None;
@@ -224,6 +277,7 @@ impl Log {
         } else {
             let [shortest, longest] = &mut self.counts.interval_s;
             (*shortest, *longest) = (shortest.min(interval_s), longest.max(interval_s));
+            self.counts.used_s += interval_s;
         }
         if new_key {
             self.last_key.clone_from(&self.row.key);

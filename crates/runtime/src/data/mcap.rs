@@ -3,6 +3,7 @@
 //! It reads from beginning to end, one record at a time. Must not trust a length in a message beyond the message's bytes.
 
 use super::form::{DataError, Meaning, Options, Row, Rows};
+use super::packed::Zstd;
 use super::stamp::Stamp;
 use super::unit::{RateUnit, TimeUnit};
 use crate::sample::Layout;
@@ -38,13 +39,14 @@ struct Content {
     schemas: BTreeMap<u16, (String, Vec<u8>)>,
     /// The topics with an angular velocity.
     topics: Vec<String>,
-    chosen: Option<(u16, Form)>,
+    /// The channels of the chosen topic.
+    chosen: Vec<(u16, Form)>,
     messages: u64,
     meaning: Meaning,
 }
 
 /// The format of a topic's messages.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 enum Form {
     /// `sensor_msgs/msg/Imu`
     Imu,
@@ -59,24 +61,46 @@ impl Mcap {
     }
 
     /// Creates a reader; it reads on the first row.
-    pub fn new(file: File, path: &Path, options: &Options) -> Self {
-        let reader = LinearReader::new_with_options(
+    ///
+    /// # Errors
+    /// [`DataError::Option`] for an option of a table.
+    pub fn new(file: File, path: &Path, options: &Options) -> Result<Self, DataError> {
+        for (name, given) in [
+            ("time", options.time.is_some()),
+            ("rates", options.rates.is_some()),
+            ("time unit", options.time_unit.is_some()),
+            ("by", options.by.is_some()),
+            ("header", !options.header),
+            ("skip", options.skip > 0),
+        ] {
+            if given {
+                let reason = "an MCAP file has topics in place of columns, and stamps in ns; leave the option out, or give a topic";
+                return Err(DataError::Option { name, reason: reason.to_owned() });
+            }
+        }
+        let mut reader = LinearReader::new_with_options(
             LinearReaderOptions::default().with_record_length_limit(RECORD_BYTES).with_prevalidate_chunk_crcs(true),
         );
+        reader.add_decompressor(Zstd::default()).expect("its name is not empty");
         let meaning = Meaning {
             time: ("header.stamp".to_owned(), TimeUnit::Nanoseconds),
-            rates: (["x", "y", "z"].map(|axis| format!("angular_velocity.{axis}")), RateUnit::RadiansPerSecond),
-            assumed: Vec::new(),
+            rates: (
+                ["x", "y", "z"].map(|axis| format!("angular_velocity.{axis}")),
+                options.rate_unit.unwrap_or(RateUnit::RadiansPerSecond),
+            ),
+            // The message's definition says rad/s, but some drivers write deg/s.
+            assumed: if options.rate_unit.is_none() { vec!["rate"] } else { Vec::new() },
+            found: String::new(),
         };
         let content = Content {
             topic: options.topic.clone(),
             schemas: BTreeMap::new(),
             topics: Vec::new(),
-            chosen: None,
+            chosen: Vec::new(),
             messages: 0,
             meaning,
         };
-        Self { path: path.to_owned(), file, reader, content }
+        Ok(Self { path: path.to_owned(), file, reader, content })
     }
 
     fn form(&self, reason: String) -> DataError {
@@ -111,7 +135,7 @@ impl Rows for Mcap {
                 Err(reason) => return Err(self.form(reason)),
             }
         }
-        if self.content.chosen.is_some() {
+        if !self.content.chosen.is_empty() {
             return Ok(false);
         }
         let columns = self.content.topics.join(", ");
@@ -132,8 +156,7 @@ impl Rows for Mcap {
 fn words(error: &McapError) -> String {
     match error {
         McapError::UnsupportedCompression(kind) => {
-            let with = if cfg!(feature = "parquet") { "" } else { "build this program with `--features parquet`, or " };
-            format!("its chunks are packed with {kind}; {with}pack them with lz4, or not at all")
+            format!("its chunks are packed with {kind}; pack them with lz4 or zstd, or not at all")
         }
         McapError::UnexpectedEof | McapError::UnexpectedEoc => {
             "it ends within a record: its recorder was stopped, or the disk was full; recover what there is of it"
@@ -153,10 +176,13 @@ impl Content {
             Record::Channel(channel) => {
                 let form = self.schemas.get(&channel.schema_id).and_then(|(name, data)| form(name, data));
                 let (Some(form), "cdr") = (form, channel.message_encoding.as_str()) else { return Ok(false) };
-                if self.topics.contains(&channel.topic) {
+                if self.chosen.iter().any(|(id, _)| *id == channel.id) {
                     return Ok(false);
                 }
-                self.topics.push(channel.topic.clone());
+                let known = self.topics.contains(&channel.topic);
+                if !known {
+                    self.topics.push(channel.topic.clone());
+                }
                 // The end of a topic's name selects it too.
                 let wanted = self.topic.as_ref().is_none_or(|topic| {
                     let rest = channel.topic.strip_suffix(topic.as_str());
@@ -165,27 +191,41 @@ impl Content {
                 if !wanted {
                     return Ok(false);
                 }
-                if self.chosen.is_some() {
-                    return Err(format!("more than one topic may be meant: {}; name one", self.topics.join(", ")));
+                match self.chosen.first() {
+                    None => {}
+                    // Another publisher of the topic.
+                    Some((_, first)) if known && *first == form => {}
+                    Some(_) if known => {
+                        return Err(format!("{} has messages of two types; record it again", channel.topic));
+                    }
+                    Some(_) => {
+                        return Err(format!("more than one topic may be meant: {}; name one", self.topics.join(", ")));
+                    }
                 }
-                self.chosen = Some((channel.id, form));
+                self.chosen.push((channel.id, form));
+                self.meaning.found = format!("topic {}", channel.topic);
                 if matches!(form, Form::Own { .. }) {
+                    if self.meaning.rates.1 != RateUnit::RadiansPerSecond {
+                        return Err(
+                            "a recording of this program is in rad/s; leave the unit of the rates out".to_owned()
+                        );
+                    }
+                    self.meaning.assumed.clear();
                     self.meaning.time.0 = "publish_time".to_owned();
                     self.meaning.rates.0 = [0, 1, 2].map(|index| format!("{OMEGA}[{index}]"));
                 }
             }
             Record::Message { header, data } => {
-                let Some((channel, form)) = self.chosen else { return Ok(false) };
-                if header.channel_id != channel {
-                    return Ok(false);
-                }
+                let chosen = self.chosen.iter().find(|(channel, _)| *channel == header.channel_id);
+                let Some((_, form)) = chosen.copied() else { return Ok(false) };
                 self.messages += 1;
                 let decoded = match form {
                     Form::Imu => imu(data),
                     Form::Own { omega, valid, generation } => own(data, header.publish_time, omega, valid, generation),
                 };
                 let (stamp, rates) = decoded.ok_or("the message is shorter than its type; log again")?;
-                (row.number, row.stamp, row.rate_rad_s) = (self.messages, stamp, rates);
+                let rad_s = self.meaning.rates.1.rad_s();
+                (row.number, row.stamp, row.rate_rad_s) = (self.messages, stamp, rates.map(|rate| rate * rad_s));
                 row.key.clear();
                 return Ok(true);
             }
@@ -331,11 +371,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let messages: Vec<_> =
             (0..9).map(|n| (0, message(true, 1, n * 1000, "imu", [f64::from(n), 2.0, 3.0]))).collect();
-        #[cfg(feature = "parquet")]
-        let zstd = [Some(mcap::Compression::Zstd)];
-        #[cfg(not(feature = "parquet"))]
-        let zstd = [];
-        for compression in [None].into_iter().chain(zstd) {
+        for compression in [None, Some(mcap::Compression::Zstd)] {
             let path = packed_file(directory.path(), &["/imu"], &messages, compression);
             let log = Log::open(&path, &Options::default()).unwrap();
             assert_eq!(log.map(Result::unwrap).count(), 9);

@@ -3,12 +3,16 @@
 //! | file | duty |
 //! |---|---|
 //! | `log` | a log, row by row, and the beginning of its segments |
+//! | `cut` | the parts of a log that are read |
 //! | `form` | options of a log, rows of a file format, errors |
 //! | `columns` | the column and the unit of each quantity |
-//! | `csv` | rows of a CSV file |
+//! | `table` | the separator, the header and the first row of a text |
+//! | `csv` | rows of a text |
 //! | `mcap` | rows of an MCAP file |
 //! | `parquet` | rows of a Parquet file, with the feature of that name |
+//! | `packed` | gzip, zstd, and files of other programs |
 //! | `stamp`, `unit` | time stamps without rounding, and units |
+//! | `plausible` | units that were assumed |
 //! | `identification` | a body's inertia from logs |
 //! | `estimation` | a log's hidden component |
 //!
@@ -17,20 +21,26 @@
 
 mod columns;
 mod csv;
+mod cut;
 mod estimation;
 mod form;
 mod identification;
 mod log;
 mod mcap;
+mod packed;
 #[cfg(feature = "parquet")]
 mod parquet;
+mod plausible;
 mod stamp;
+mod table;
 mod unit;
 
+pub use cut::read_parts;
 pub use estimation::{EstimateError, Estimated, Estimation, FilterOrder, Request, estimate_log};
-pub use form::{DataError, Meaning, Options};
+pub use form::{Cut, DataError, Meaning, Options};
 pub use identification::{Identified, LogAccount, Ways, identify_logs};
 pub use log::{Counts, Entry, Log};
+pub use plausible::check_scale;
 pub use unit::{RateUnit, TimeUnit};
 
 #[cfg(test)]

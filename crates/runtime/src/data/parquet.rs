@@ -59,9 +59,10 @@ impl ParquetLog {
         let reader = SerializedFileReader::new(file).map_err(|error| form(&error))?;
         let schema = reader.metadata().file_metadata().schema_descr();
         let names: Vec<String> = schema.columns().iter().map(|column| column.path().string()).collect();
-        let mut places = columns::find(&names, path, &Options { header: true, ..options.clone() })?;
-        let time = schema.column(places.time);
-        if let (None, Some(LogicalType::Timestamp(about))) = (options.time_unit, time.logical_type_ref()) {
+        let mut places = columns::find(&names, path, &Options { header: true, ..options.clone() }, |_| String::new())?;
+        let time = places.time.map(|column| schema.column(column));
+        let kind = time.as_ref().and_then(|time| time.logical_type_ref());
+        if let (None, Some(LogicalType::Timestamp(about))) = (options.time_unit, kind) {
             // The type is certain; a name is only a hint.
             places.meaning.time.1 = match about.unit {
                 Unit::MILLIS => TimeUnit::Milliseconds,
@@ -94,7 +95,8 @@ impl ParquetLog {
     fn begin_group(&mut self) -> Result<(), ParquetError> {
         let group = self.reader.get_row_group(self.group)?;
         let places = &self.places;
-        let wanted = [Some(places.time)].into_iter().chain(places.rates).chain([places.by]);
+        let part = places.time_part.map(|(column, _)| column);
+        let wanted = [places.time].into_iter().chain(places.rates).chain([places.by, part]);
         let schema = self.reader.metadata().file_metadata().schema_descr();
         let mut columns = Vec::new();
         for index in wanted {
@@ -126,6 +128,19 @@ impl ParquetLog {
         let name = found.map_or(String::new(), |column| column.name.clone());
         let (path, reason) = (self.path.clone(), reason.to_owned());
         DataError::Cell { path, line: self.rows, column: name, text, reason }
+    }
+
+    /// Returns a time stamp.
+    fn stamp(&self, column: usize, unit: TimeUnit) -> Result<Option<Stamp>, DataError> {
+        let late = || self.cell_error(column, "is out of the range of time stamps; correct it");
+        match self.cell(column) {
+            Cell::None => Ok(None),
+            Cell::Whole(value) if value.unsigned_abs() < 1 << 62 => Ok(Some(Stamp::whole(*value, unit))),
+            Cell::Float(value) if value.is_nan() => Ok(None),
+            Cell::Float(value) => Stamp::float(*value, unit).map(Some).ok_or_else(late),
+            Cell::Whole(_) => Err(late()),
+            Cell::Text(_) => Err(self.cell_error(column, "is a text; give numbers")),
+        }
     }
 
     fn cell(&self, column: usize) -> &Cell {
@@ -186,17 +201,13 @@ impl Rows for ParquetLog {
         self.rows += 1;
         row.number = self.rows;
         let unit = self.places.meaning.time.1;
-        row.stamp = match self.cell(0) {
-            Cell::None => None,
-            Cell::Whole(value) if value.unsigned_abs() < 1 << 62 => Some(Stamp::whole(*value, unit)),
-            Cell::Float(value) if value.is_nan() => None,
-            Cell::Float(value) => match Stamp::float(*value, unit) {
-                None => return Err(self.cell_error(0, "is out of the range of time stamps; correct it")),
-                stamp => stamp,
-            },
-            Cell::Whole(_) => return Err(self.cell_error(0, "is out of the range of time stamps; correct it")),
-            Cell::Text(_) => return Err(self.cell_error(0, "is a text; give numbers")),
+        row.stamp = match self.places.time {
+            Some(_) => self.stamp(0, unit)?,
+            None => Some(Stamp::whole((self.rows - 1) as i64, unit)),
         };
+        if let (Some((_, unit)), Some(stamp)) = (self.places.time_part, row.stamp) {
+            row.stamp = self.stamp(5, unit)?.map(|part| stamp.plus(&part));
+        }
         let rad_s = self.places.meaning.rates.1.rad_s();
         for axis in 0..3 {
             row.rate_rad_s[axis] = match self.cell(1 + axis) {

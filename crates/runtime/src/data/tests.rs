@@ -91,27 +91,37 @@ fn an_invalid_log_is_refused_with_place_reason_and_remedy() {
     for (text, words) in [
         ("", "it has no row of numbers"),
         ("t_s,wx,wy,wz\n", "it has no row of numbers"),
-        ("t_s;wx;wy;wz\n0;1,5;2;3\n", "log.csv:2: column wx: `1,5` has a decimal comma; write"),
         ("t_s,wx,wy,wz\n0,0,1,5,2,0,3,0\n", "log.csv:2: the row has 8 cells, the first one has 4"),
         ("t_s,wx,wy,wz\n0,1,2,3\n0.1,1,2\n", "log.csv:3: the row has 3 cells"),
         ("t_s,wx,wy,wz\n0,1,2,3\n\n0.1,1,two,3\n", "log.csv:4: column wy: `two` is not a number"),
         ("t_s,wx,wy,wz\n0,inf,2,3\n", "`inf` is not finite"),
         ("t_s,wx,wy,wz\n0,1e999,2,3\n", "`1e999` is not finite"),
         ("t_s,wx,wy,wz\n1e300,1,2,3\n", "out of the range of time stamps"),
-        ("t_s,wx,wy,wz\n12:30:01,1,2,3\n", "column t_s: `12:30:01` is not a number"),
-        ("t,wx,wy,wz\n0,1,2,3\n10020000,1,2,3\n20040000,1,2,3\n", "say what they are in with a unit of time"),
+        ("t_s,wx,wy,wz\n12:30:01,1,2,3\n12:30,1,2,3\n", "column t_s: `12:30` is not a time of day"),
+        ("t,wx,wy,wz\n0,1,2,3\n10020000,1,2,3\n20040000,1,2,3\n", "give --time-unit us"),
         ("\0\0", "the file is not text"),
         ("0,1,2,3\n1,1,2,3\n", "if it has no header say so"),
     ] {
         let refused = refusal(text, &none);
         assert!(refused.contains(words), "{text:?}: {refused}");
     }
-    let utf16 = Log::from_csv(Cursor::new([0xff, 0xfe, b't', 0]), "log.csv".as_ref(), &none).err().unwrap();
-    assert!(utf16.to_string().contains("save it as UTF-8"));
     let gap = Options { gap_s: Some(-1.0), ..Options::default() };
     assert!(refusal("t_s,wx,wy,wz\n0,1,2,3\n", &gap).contains("give a number above 0"));
     let missing = Log::open("no/such/file".as_ref(), &none).err().unwrap().to_string();
     assert!(missing.contains("cannot read no/such/file"), "{missing}");
+}
+
+#[test]
+fn utf_16_is_read_with_or_without_a_byte_order_mark() {
+    let text = "t (µs);gyro_x (°/s);gyro_y (°/s);gyro_z (°/s)\r\n0;180;0;0\r\n1000;90;0;0\r\n";
+    let little: Vec<u8> = text.encode_utf16().flat_map(u16::to_le_bytes).collect();
+    let big: Vec<u8> = text.encode_utf16().flat_map(u16::to_be_bytes).collect();
+    for bytes in [little.clone(), big, [vec![0xff, 0xfe], little].concat()] {
+        let mut log = Log::from_csv(Cursor::new(bytes), "log.csv".as_ref(), &Options::default()).unwrap();
+        let entry = log.nth(1).unwrap().unwrap();
+        assert_eq!((entry.time_s, entry.rate_rad_s[0]), (1e-3, std::f64::consts::FRAC_PI_2));
+        assert!(log.meaning().found.contains("UTF-16"), "{:?}", log.meaning());
+    }
 }
 
 #[test]
@@ -154,5 +164,5 @@ fn check(bytes: Vec<u8>) {
     }
     let counts = log.counts();
     assert_eq!(counts.used, used);
-    assert_eq!(counts.rows, counts.used + counts.incomplete + counts.repeated);
+    assert_eq!(counts.rows, counts.used + counts.incomplete + counts.repeated + counts.outside);
 }

@@ -2,7 +2,8 @@
 //!
 //! This file knows no ticks, and does not repair the log: a segment is taken as the reader returns it.
 
-use crate::data::{DataError, Log, Options, RateUnit, TimeUnit};
+use crate::data::{Cut, DataError, Log, Options, RateUnit, TimeUnit, check_scale};
+use crate::identify::{self, Sample};
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -28,7 +29,15 @@ pub(super) struct RawPlayback {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rate_unit: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
+    pub rate_scale: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rate_hz: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub skip: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub by: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub between_s: Option<[f64; 2]>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub segment: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -102,6 +111,8 @@ pub(super) struct Playback {
     end_s: f64,
     repeats: bool,
     hash: u64,
+    /// The units that were assumed, as text.
+    assumed: Option<String>,
 }
 
 /// The samples of a motion while they are read.
@@ -141,18 +152,32 @@ impl RawPlayback {
     fn options(&self) -> Result<Options, PlaybackError> {
         let unit = |name: &Option<String>, quantity: &'static str| name.clone().map(|name| (name, quantity));
         let time_unit = unit(&self.time_unit, "of time: s, ms, us or ns");
-        let rate_unit = unit(&self.rate_unit, "of angular velocity: rad/s or deg/s");
+        let rate_unit = unit(&self.rate_unit, "of angular velocity: rad/s, deg/s, mdps, mrad/s, rpm or rev/s");
+        let number = |name: &'static str, given: Option<f64>| match given {
+            Some(number) if !(number.is_finite() && number > 0.0) => {
+                Err(DataError::Option { name, reason: format!("{number} is out of range; give a number above 0") })
+            }
+            given => Ok(given),
+        };
         let unknown = |(name, quantity): (String, &'static str)| PlaybackError::Unit(name, quantity);
         Ok(Options {
             topic: self.topic.clone(),
             time: self.time.clone(),
             rates: self.rates.clone(),
-            time_unit: time_unit.map(|named| TimeUnit::parse(&named.0).ok_or_else(|| unknown(named))).transpose()?,
-            rate_unit: rate_unit.map(|named| RateUnit::parse(&named.0).ok_or_else(|| unknown(named))).transpose()?,
+            time_unit: time_unit
+                .map(|named| TimeUnit::parse(&named.0).ok_or_else(|| unknown(named)))
+                .transpose()?
+                .or(number("rate_hz", self.rate_hz)?.map(TimeUnit::Count)),
+            rate_unit: rate_unit
+                .map(|named| RateUnit::parse(&named.0).ok_or_else(|| unknown(named)))
+                .transpose()?
+                .or(number("rate_scale", self.rate_scale)?.map(RateUnit::Scale)),
             by: self.by.clone(),
             gap_s: self.gap_s,
             header: !self.headerless.unwrap_or(false),
+            skip: self.skip.unwrap_or(0),
             needed: [true; 3],
+            cut: self.between_s.map_or(Cut::Whole, |between| Cut::Between(vec![between])),
         })
     }
 
@@ -175,16 +200,22 @@ impl RawPlayback {
         };
         let (mut names, mut motion) =
             (Vec::new(), Motion::new(if self.at_end == AtEnd::Repeat { f64::INFINITY } else { duration_s }));
+        let mut free = identify::Motion::default();
         while let Some(entry) = log.next() {
             let entry = entry?;
             if entry.begins {
+                free.end_segment();
                 names.push(log.segment_name());
             }
             let asked = self.segment.as_ref().map_or(names.len() == 1, |segment| names.last() == Some(segment));
             if asked {
+                free.push(&Sample { time_s: entry.time_s, rate_rad_s: entry.rate_rad_s.into() });
                 motion.add(entry.time_s, own * Vector3::from(entry.rate_rad_s));
             }
         }
+        free.end_segment();
+        check_scale(log.path(), log.meaning(), &free)?;
+        let assumed = log.meaning().assumed_text();
         let path = log.path().display().to_string();
         let listed = || names.iter().take(NAMES_LISTED).cloned().collect::<Vec<_>>().join(", ");
         match &self.segment {
@@ -197,7 +228,7 @@ impl RawPlayback {
             _ if motion.count < 2 => return Err(PlaybackError::Short { path, samples: motion.count }),
             _ => {}
         }
-        let playback = Playback::new(motion, self.at_end == AtEnd::Repeat);
+        let playback = Playback { assumed, ..Playback::new(motion, self.at_end == AtEnd::Repeat) };
         match &self.hash {
             Some(hash) if *hash != playback.hash() => Err(PlaybackError::Changed { path, found: playback.hash() }),
             _ => Ok(playback),
@@ -227,12 +258,17 @@ impl Playback {
             // Repetition does not change the motion itself.
             knots.push(Knot { time_s: end_s, ..knots[0] });
         }
-        Self { knots, count, end_s, repeats, hash: hash.digest() }
+        Self { knots, count, end_s, repeats, hash: hash.digest(), assumed: None }
     }
 
     /// Returns the hash of the samples.
     pub fn hash(&self) -> String {
         format!("{:016x}", self.hash)
+    }
+
+    /// Returns the units that were assumed, as text; `None` if all are given.
+    pub fn assumed(&self) -> Option<&str> {
+        self.assumed.as_deref()
     }
 
     /// Returns the length of the motion, s. After it, the motion starts again or is over.
@@ -417,10 +453,10 @@ mod tests {
         let kept = RawPlayback { hash: Some(found.hash()), ..named("b") };
         assert_eq!(load(text, &kept).unwrap().hash(), found.hash());
         assert!(matches!(load(&text.replace("6,0,0", "6,0,1"), &kept), Err(PlaybackError::Changed { .. })));
-        let bad = RawPlayback { rate_unit: Some("rpm".into()), ..named("b") };
+        let bad = RawPlayback { rate_unit: Some("Hz".into()), ..named("b") };
         assert_eq!(
             load(text, &bad).unwrap_err().to_string(),
-            "`rpm` is not a unit of angular velocity: rad/s or deg/s"
+            "`Hz` is not a unit of angular velocity: rad/s, deg/s, mdps, mrad/s, rpm or rev/s"
         );
     }
 

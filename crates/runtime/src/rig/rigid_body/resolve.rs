@@ -172,6 +172,7 @@ fn load_playback(
         "leader.data: the motion of {samples} samples over {:.6} s, at most {longest_s:.6} s apart, joined by cubics (Hermite)",
         playback.length_s()
     ));
+    notes.extend(playback.assumed().map(|assumed| format!("leader.data: {assumed}")));
     if let Some(error) = playback.coarse_error_rad_s() {
         notes.push(format!(
             "leader.data: cubics through every second sample miss the other samples by at most {error:.3e} rad/s, noise included"

@@ -1,0 +1,138 @@
+//! Refuses a log whose assumed units are impossible, and names the likely ones. Must not change a unit.
+
+use super::form::{DataError, Meaning};
+use super::stamp::Stamp;
+use super::unit::{RateUnit, TimeUnit};
+use crate::identify::{Motion, wrong_scale};
+use std::f64::consts::PI;
+use std::path::Path;
+
+/// The range of a usual interval, s.
+const INTERVALS_S: std::ops::Range<f64> = 1e-5..100.0;
+/// The range of a likely one.
+const LIKELY_INTERVALS_S: std::ops::Range<f64> = 1e-4..100.0;
+/// The fastest rate of a body in a log without units, rad/s.
+const FASTEST_RAD_S: f64 = 100.0;
+/// The largest turn of a body between samples that are likely, rad.
+const LIKELY_TURN_RAD: f64 = 1.0;
+
+/// The bounds of a log's values if its assumed units are right.
+#[derive(Debug, Clone, Copy)]
+pub struct Plausible {
+    /// The usual interval, s.
+    usual_s: Option<f64>,
+    /// The fastest rate that is possible, rad/s.
+    fastest_rad_s: f64,
+}
+
+impl Plausible {
+    /// Checks the usual interval and the first stamp.
+    ///
+    /// # Errors
+    /// [`DataError::Unit`].
+    pub fn new(path: &Path, meaning: &Meaning, usual_s: Option<f64>, first: Option<&Stamp>) -> Result<Self, DataError> {
+        let assumed = |what| meaning.assumed.contains(&what);
+        if assumed("time") {
+            if let Some(usual_s) = usual_s.filter(|usual_s| !INTERVALS_S.contains(usual_s)) {
+                let reason = format!("the usual interval would be {usual_s} s");
+                return Err(refuse(path, meaning, reason, likely(meaning, Some(usual_s), None)));
+            }
+            let late = first.filter(|_| meaning.time.1 == TimeUnit::Seconds).map(Stamp::units);
+            if let Some((units, unit)) = late.and_then(|units| Some((units, since_1970(units)?))) {
+                let likely = format!("the stamps are likely in {unit}: give --time-unit {unit}");
+                return Err(refuse(path, meaning, format!("the first stamp would be {units} s"), likely));
+            }
+        }
+        let by_turn = usual_s.filter(|_| !meaning.assumed.is_empty()).map_or(f64::INFINITY, |usual_s| PI / usual_s);
+        let by_rate = if assumed("rate") { FASTEST_RAD_S } else { f64::INFINITY };
+        Ok(Self { usual_s, fastest_rad_s: by_turn.min(by_rate) })
+    }
+
+    /// Checks a row.
+    ///
+    /// # Errors
+    /// [`DataError::Unit`].
+    pub fn check(&self, path: &Path, meaning: &Meaning, row: u64, rates_rad_s: [f64; 3]) -> Result<(), DataError> {
+        let square: f64 = rates_rad_s.iter().filter(|rate| rate.is_finite()).map(|rate| rate * rate).sum();
+        if square <= self.fastest_rad_s * self.fastest_rad_s {
+            return Ok(());
+        }
+        let rate_rad_s = square.sqrt();
+        let turn = self
+            .usual_s
+            .map_or(String::new(), |usual_s| format!(", and turn by {:.1} rad between samples", rate_rad_s * usual_s));
+        let reason = format!("row {row}: the body would turn at {rate_rad_s:.1} rad/s{turn}");
+        Err(refuse(path, meaning, reason, likely(meaning, self.usual_s, Some(rate_rad_s))))
+    }
+}
+
+/// Returns the unit of a stamp that would be thousands of years after 1970 in s: about 1.8e9 s have passed.
+pub fn since_1970(units: i64) -> Option<TimeUnit> {
+    match units {
+        ..100_000_000_000 => None,
+        100_000_000_000..100_000_000_000_000 => Some(TimeUnit::Milliseconds),
+        100_000_000_000_000..100_000_000_000_000_000 => Some(TimeUnit::Microseconds),
+        _ => Some(TimeUnit::Nanoseconds),
+    }
+}
+
+/// Checks the scale of a motion in a log with assumed units: Euler's equations hold only at one.
+///
+/// # Errors
+/// [`DataError::Unit`].
+pub fn check_scale(path: &Path, meaning: &Meaning, motion: &Motion) -> Result<(), DataError> {
+    let factor = if meaning.assumed.is_empty() { None } else { wrong_scale(motion) };
+    factor.map_or(Ok(()), |factor| Err(scaled(path, meaning, factor)))
+}
+
+/// Returns the error for a motion that is free if its rates, or its times, are `factor` times as large.
+fn scaled(path: &Path, meaning: &Meaning, factor: f64) -> DataError {
+    let same = |scale: f64| (scale / factor - 1.0).abs() < 1e-3;
+    let mut found = Vec::new();
+    let assumed = |what| meaning.assumed.contains(&what);
+    if let Some(unit) = TimeUnit::NUMBERS.iter().find(|unit| assumed("time") && same(1.0 / unit.per_second())) {
+        found.push(format!("the stamps are likely in {unit}: give --time-unit {unit}"));
+    }
+    if let Some(unit) = RateUnit::NUMBERS.iter().find(|unit| assumed("rate") && same(unit.rad_s())) {
+        found.push(format!("the rates are likely in {unit}: give --rate-unit {unit}"));
+    }
+    if found.is_empty() {
+        found.push("say what they are in with --time-unit and --rate-unit".to_owned());
+    }
+    let reason = format!("Euler's equations hold only for rates that are {factor:.3e} times as large");
+    refuse(path, meaning, reason, found.join("; or "))
+}
+
+/// Returns the error for assumed units.
+fn refuse(path: &Path, meaning: &Meaning, reason: String, likely: String) -> DataError {
+    let assumed = meaning.assumed_text().unwrap_or_default();
+    DataError::Unit { path: path.to_owned(), reason, assumed, likely }
+}
+
+/// Returns the units that make interval and rate likely, with their options. One unit is replaced at a time.
+fn likely(meaning: &Meaning, usual_s: Option<f64>, rate_rad_s: Option<f64>) -> String {
+    let fits = |time: f64, rate: f64| {
+        let (usual_s, rate_rad_s) = (usual_s.map(|usual_s| usual_s * time), rate_rad_s.map(|own| own * rate));
+        let turn_rad = usual_s.unwrap_or(0.0) * rate_rad_s.unwrap_or(0.0);
+        usual_s.is_none_or(|usual_s| LIKELY_INTERVALS_S.contains(&usual_s))
+            && rate_rad_s.is_none_or(|rate_rad_s| rate_rad_s < FASTEST_RAD_S)
+            && turn_rad < LIKELY_TURN_RAD
+    };
+    let mut found = Vec::new();
+    if meaning.assumed.contains(&"time") {
+        let own = meaning.time.1.per_second();
+        let unit = TimeUnit::NUMBERS[1..].iter().find(|unit| fits(own / unit.per_second(), 1.0));
+        found.extend(unit.map(|unit| format!("the stamps are likely in {unit}: give --time-unit {unit}")));
+    }
+    if meaning.assumed.contains(&"rate") {
+        let own = meaning.rates.1.rad_s();
+        // Beside a unit of time only the most usual one.
+        let units = if found.is_empty() { &RateUnit::NUMBERS[1..] } else { &RateUnit::NUMBERS[1..2] };
+        let unit = units.iter().find(|unit| fits(1.0, unit.rad_s() / own));
+        found.extend(unit.map(|unit| format!("the rates are likely in {unit}: give --rate-unit {unit}")));
+    }
+    if found.is_empty() {
+        found.push("say what they are in with --time-unit and --rate-unit, or with --rate-scale".to_owned());
+    }
+    found.join("; or ")
+}

@@ -1,0 +1,303 @@
+//! Logs as other programs write them: read at the first try, or refused with their unit or the motion named.
+
+use crate::common::Bench;
+use corotate::model::{Inertia, RigidBody};
+use nalgebra::Vector3;
+use std::fmt::Write;
+
+const MOMENTS: [f64; 3] = [0.4, 0.8, 1.0];
+
+/// Returns time and rates of a free motion, s and rad/s, at 100 Hz.
+fn motion(samples: u32) -> Vec<[f64; 4]> {
+    let body = RigidBody::new(&Inertia::new(MOMENTS).unwrap());
+    let mut rate = Vector3::new(8.0, 1.0, 6.0);
+    let sample = |tick| {
+        let row = [f64::from(tick) * 0.01, rate.x, rate.y, rate.z];
+        rate = body.flow(&rate, &Vector3::zeros(), 0.01);
+        row
+    };
+    (0..samples).map(sample).collect()
+}
+
+/// Returns a table of the motion: each row by `row`, each rate in a unit of `rad_s` rad/s.
+fn table(head: &str, rad_s: f64, row: impl Fn(f64, [String; 3]) -> String) -> String {
+    let rows = motion(80)
+        .into_iter()
+        .map(|[time_s, x, y, z]| row(time_s, [x, y, z].map(|rate| format!("{:.5}", rate / rad_s))));
+    rows.fold(head.to_owned(), |text, row| text + &row + "\n")
+}
+
+fn plain(head: &str, rad_s: f64) -> String {
+    table(head, rad_s, |time_s, [x, y, z]| format!("{time_s:.2},{x},{y},{z}"))
+}
+
+fn in_deg(head: &str) -> String {
+    plain(head, std::f64::consts::PI / 180.0)
+}
+
+/// Returns a text in Latin-1.
+fn latin1(text: &str) -> Vec<u8> {
+    text.chars().map(|letter| u8::try_from(u32::from(letter)).unwrap()).collect()
+}
+
+#[test]
+fn tables_of_many_forms_give_the_body_at_the_first_try() {
+    let bench = Bench::new();
+    let semicolons = |head: &str| table(head, 1.0, |t, rates| format!("{t:.2};{}", rates.join(";")).replace('.', ","));
+    let clock = |t: f64| format!("12:00:{t:06.3}");
+    let last_cut = {
+        let mut text = plain("t,wx,wy,wz\n", 1.0);
+        text.truncate(text.len() - 12);
+        text
+    };
+    let forms: Vec<(&str, Vec<u8>)> = vec![
+        ("decimal-comma.csv", semicolons("t;wx;wy;wz\n").into()),
+        ("preamble.csv", plain("Device: phone\nRate, 100, Version, 2\n\nt (s),wx (rad/s),wy (rad/s),wz (rad/s)\n", 1.0).into()),
+        ("comments.csv", plain("% made by\n// a logger\nt,wx,wy,wz\n", 1.0).into()),
+        ("in-comment.csv", plain("#timestamp [s],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1]\n", 1.0).into()),
+        ("two-lines.csv", semicolons("Time (s);IMU Gyroscope;;\n;X;Y;Z\n").into()),
+        ("units-below.csv", in_deg("time,gyro_x,gyro_y,gyro_z\ns,deg/s,deg/s,deg/s\n").into()),
+        ("spaces.txt", table(" time  wx wy   wz\n", 1.0, |t, rates| format!("  {t:.2}   {}", rates.join("  "))).into()),
+        ("pipes.txt", table("time|wx|wy|wz\n", 1.0, |t, rates| format!("{t:.2} | {}", rates.join(" | "))).into()),
+        ("no-line-end.csv", last_cut.into()),
+        ("zeros.csv", [plain("t,wx,wy,wz\n", 1.0).into_bytes(), vec![0; 3000]].concat()),
+        ("clock.csv", table("time,wx,wy,wz\n", 1.0, |t, rates| format!("{},{}", clock(t), rates.join(","))).into()),
+        ("iso.csv", table("Date,wx,wy,wz\n", 1.0, |t, r| format!("2026-11-28T{}Z,{}", clock(t), r.join(","))).replace("Date", "datetime").into()),
+        ("micro.csv", latin1(&table("time (µs);gx;gy;gz\n", 1.0, |t, rates| format!("{:.0};{}", t * 1e6, rates.join(";"))))),
+        ("degree-latin1.csv", latin1(&in_deg("t_s,Gyro X (°/s),Gyro Y (°/s),Gyro Z (°/s)\n"))),
+        ("degree-mac.csv", latin1(&in_deg("t_s,Gyro X (¡/s),Gyro Y (¡/s),Gyro Z (¡/s)\n"))),
+        ("degree-ring.csv", in_deg("t_s,Gyro X (˚/s),Gyro Y (˚/s),Gyro Z (˚/s)\n").into()),
+        ("degree-ordinal.csv", in_deg("t_s,Gyro X (º/s),Gyro Y (º/s),Gyro Z (º/s)\n").into()),
+        ("rpm.csv", plain("t_s,gyro_x (rpm),gyro_y (rpm),gyro_z (rpm)\n", std::f64::consts::TAU / 60.0).into()),
+        ("mdps.csv", plain("t_s,gyro_x_mdps,gyro_y_mdps,gyro_z_mdps\n", std::f64::consts::PI / 180e3).into()),
+        ("one-based.csv", plain("time,gyro_1,gyro_2,gyro_3\n", 1.0).into()),
+        ("phyphox.csv", plain("\"Time (s)\",\"X (rad/s)\",\"Y (rad/s)\",\"Z (rad/s)\"\n", 1.0).into()),
+        ("Gyroscope.csv", table("time,seconds_elapsed,z,y,x\n", 1.0, |t, [x, y, z]| {
+            format!("{:.0},{t:.3},{z},{y},{x}", 1.7e18 + t * 1e9)
+        }).into()),
+        ("betaflight.csv", in_deg("time (s),gyroADC[0] (deg/s),gyroADC[1] (deg/s),gyroADC[2] (deg/s)\n").into()),
+        ("bag.csv", table("%time,field.header.stamp,field.angular_velocity.x,field.angular_velocity.y,field.angular_velocity.z\n", 1.0,
+            |t, rates| format!("{:.0},{:.0},{}", 1.7e18 + t * 1e9, 1.7e18 + t * 1e9, rates.join(","))).into()),
+        ("plotjuggler.csv", plain("__time,/imu/angular_velocity/x,/imu/angular_velocity/y,/imu/angular_velocity/z\n", 1.0).into()),
+        ("stamps.csv", table("header.stamp.sec,header.stamp.nanosec,angular_velocity.x,angular_velocity.y,angular_velocity.z\n", 1.0,
+            |t, rates| format!("1700000000,{:.0},{}", t * 1e9, rates.join(","))).into()),
+        ("sensorlog.csv", plain("motionTimestamp_sinceReboot(s),motionRotationRateX(rad/s),motionRotationRateY(rad/s),motionRotationRateZ(rad/s)\n", 1.0).into()),
+        ("ardupilot.csv", table("TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n", 1.0, |t, rates| format!("{:.0},{},0,0,9.8", t * 1e6, rates.join(","))).into()),
+        (
+            "epoch.csv",
+            table("time,wx,wy,wz\n", 1.0, |t, rates| format!("{:.0},{}", 1.7e12 + t * 1e3, rates.join(","))).into(),
+        ),
+        ("euler.csv", in_deg("seconds_elapsed,roll_rate_dps,pitch_rate_dps,yaw_rate_dps\n").into()),
+        ("capitals.CSV", plain("TIME,WX,WY,WZ\n", 1.0).into()),
+    ];
+    for (name, bytes) in forms {
+        std::fs::write(bench.path(name), bytes).unwrap();
+        let done = bench.run(&["identify", name, "--json"]);
+        assert_eq!(done.code, Some(0), "{name}: {}", done.stderr);
+        let found = done.json();
+        for (moment, expected) in found["body"]["inertia_kg_m2"].as_array().unwrap().iter().zip(MOMENTS) {
+            assert!((moment.as_f64().unwrap() - expected).abs() < 0.01, "{name}: {found:#}");
+        }
+    }
+    // The options for what is not found out.
+    let counted =
+        table("PacketCounter,IMU A,IMU B,IMU C\n", 1.0, |t, rates| format!("{:.0},{}", t * 100.0, rates.join(",")));
+    std::fs::write(bench.path("counter.csv"), format!("1,2,3,4\n1,2,3,4\n{counted}")).unwrap();
+    let options = ["--skip", "2", "--time", "1", "--rates", "imu a,IMU B,4", "--rate-hz", "100"];
+    let found = bench.run(&[&["identify", "counter.csv", "--json"], &options[..]].concat()).succeeded().json();
+    assert!((found["body"]["inertia_kg_m2"][0].as_f64().unwrap() - 0.4).abs() < 0.01, "{found:#}");
+    let scaled = plain("t_s,gyro_x (lsb),gyro_y (lsb),gyro_z (lsb)\n", 0.001);
+    std::fs::write(bench.path("lsb.csv"), scaled).unwrap();
+    let found = bench.run(&["identify", "lsb.csv", "--json", "--rate-scale", "0.001"]).succeeded().json();
+    assert!((found["body"]["inertia_kg_m2"][0].as_f64().unwrap() - 0.4).abs() < 0.01, "{found:#}");
+}
+
+#[test]
+fn the_end_of_a_damaged_table_is_left_out_and_counted() {
+    let bench = Bench::new();
+    let text = plain("t,wx,wy,wz\n", 1.0);
+    std::fs::write(bench.path("half.csv"), format!("{text}0.80,1.2")).unwrap();
+    std::fs::write(bench.path("zeros.csv"), format!("{text}0.80,1.2\0\0\0\0\n1,2,3,4\n")).unwrap();
+    for (name, zeros) in [("half.csv", 0), ("zeros.csv", 1)] {
+        let found = bench.run(&["identify", name, "--json"]).succeeded().json();
+        let counts = &found["logs"][0]["counts"];
+        let seen = [&counts["rows"], &counts["half_written"], &counts["zero_tail"]];
+        assert_eq!(seen, [80, 1, zeros].map(serde_json::Value::from).each_ref(), "{name}: {counts}");
+    }
+    // Within the table it is a mistake.
+    std::fs::write(bench.path("short.csv"), text.replacen("0.40,", "", 1)).unwrap();
+    let refused = bench.run(&["identify", "short.csv"]);
+    assert!(refused.code == Some(2) && refused.says("row-length"), "{refused:?}");
+}
+
+#[test]
+fn units_that_are_impossible_or_not_known_are_refused_by_name() {
+    let bench = Bench::new();
+    let rpm = std::f64::consts::TAU / 60.0;
+    let millis = |head: &str| table(head, 1.0, |t, rates| format!("{:.0},{}", t * 1e3, rates.join(",")));
+    // A slow body turns by little between samples in wrong units too; only its motion shows them.
+    let slow = |rad_s: f64, per_second: f64| {
+        motion(400).into_iter().fold("t,wx,wy,wz\n".to_owned(), |mut text, [t, x, y, z]| {
+            let [x, y, z] = [x, y, z].map(|rate| 0.02 * rate / rad_s);
+            writeln!(text, "{:.1},{x:.9},{y:.9},{z:.9}", t * 50.0 * per_second).unwrap();
+            text
+        })
+    };
+    let deg = std::f64::consts::PI / 180.0;
+    let hidden = ["--hidden", "z", "--inertia", ".4,.8,1"];
+    for (name, text, parts) in [
+        ("deg.csv", in_deg("t,wx,wy,wz\n"), &["deg/s", "implausible-unit"][..]),
+        ("ms.csv", millis("time,wx,wy,wz\n"), &["--time-unit ms", "implausible-unit"]),
+        ("mrad.csv", plain("t,xgyro,ygyro,zgyro\n", 1e-3), &["implausible-unit"]),
+        ("slow-deg.csv", slow(deg, 1.0), &["--rate-unit deg/s", "implausible-unit"]),
+        ("slow-rpm.csv", slow(rpm, 1.0), &["--rate-unit rpm", "implausible-unit"]),
+        ("slow-ms.csv", slow(1.0, 1e3), &["implausible-unit"]),
+        (
+            "lost.csv",
+            in_deg("t_s,Gyro X (\u{fffd}/s),Gyro Y (\u{fffd}/s),Gyro Z (\u{fffd}/s)\n"),
+            &["\u{fffd}/s", "unknown-unit"],
+        ),
+        ("absent.csv", in_deg("t_s,Gyro X (/s),Gyro Y (/s),Gyro Z (/s)\n"), &["`/s`", "unknown-unit"]),
+        ("gon.csv", in_deg("t_s,Gyro X (gon/s),Gyro Y (gon/s),Gyro Z (gon/s)\n"), &["gon/s", "unknown-unit"]),
+        ("minutes.csv", plain("Time (min),wx,wy,wz\n", 1.0), &["min", "unknown-unit"]),
+    ] {
+        std::fs::write(bench.path(name), text).unwrap();
+        for command in [&["identify", name][..], &[&["estimate", name], &hidden[..]].concat()] {
+            let refused = bench.run(command);
+            let code = if parts.contains(&"unknown-unit") { 2 } else { 1 };
+            assert_eq!(refused.code, Some(code), "{command:?}: {refused:?}");
+            assert!(refused.stdout.is_empty(), "{command:?}: {refused:?}");
+            assert!(parts.iter().all(|part| refused.stderr.contains(part)), "{command:?}: {}", refused.stderr);
+        }
+    }
+    // However the columns were chosen.
+    let named = ["--rates", "Gyro X (gon/s),Gyro Y (gon/s),Gyro Z (gon/s)"];
+    let refused = bench.run(&[&["identify", "gon.csv"], &named[..]].concat());
+    assert!(refused.code == Some(2) && refused.says("unknown-unit"), "{refused:?}");
+    let given = [&["identify", "deg.csv"][..], &["--rate-unit", "deg/s", "--time-unit", "s"]].concat();
+    bench.run(&given).succeeded();
+    let leader = bench.run(&["init", "recorded-leader"]).succeeded().stdout.replace("tumbling-throw.csv", "deg.csv");
+    std::fs::write(bench.path("own.toml"), leader).unwrap();
+    let refused = bench.run(&["check", "own.toml"]);
+    assert!(refused.code == Some(2) && refused.says("implausible-unit"), "{refused:?}");
+    std::fs::write(bench.path("deg.csv"), plain("t,wx,wy,wz\n", 1.0)).unwrap();
+    let assumed = bench.run(&["check", "own.toml"]);
+    assert!(assumed.stdout.contains("wx, wy, wz in rad/s, as assumed"), "{assumed:?}");
+}
+
+#[test]
+fn a_motion_that_is_not_free_gives_no_body_in_a_short_log_too() {
+    let bench = Bench::new();
+    for (name, samples, step_s) in [("short.csv", 60, 0.05), ("long.csv", 3000, 0.01), ("fast.csv", 100, 0.02)] {
+        let mut text = String::from("time_s,wx_rad_s,wy_rad_s,wz_rad_s\n");
+        for tick in 0..samples {
+            let t = f64::from(tick) * step_s;
+            let rates = [1.0 + (3.0 * t).sin(), (2.3 * t).sin() + 0.2 * (5.1 * t).cos(), 4.0 + (1.7 * t).cos()];
+            writeln!(text, "{t:.2},{:.4},{:.4},{:.4}", rates[0], rates[1], rates[2]).unwrap();
+        }
+        std::fs::write(bench.path(name), text).unwrap();
+        for method in ["axes", "tensor", "recursive"] {
+            let refused = bench.run(&["identify", name, "--method", method]);
+            assert!(refused.code == Some(1) && refused.says("not-free"), "{name} {method}: {refused:?}");
+            assert!(!refused.stdout.contains("inertia_kg_m2"), "{name} {method}: {refused:?}");
+            let json = bench.run(&["identify", name, "--method", method, "--json"]);
+            assert!(json.json()["body"].is_null(), "{name} {method}: {json:?}");
+        }
+    }
+}
+
+#[test]
+fn an_estimate_tells_why_it_is_useless() {
+    let bench = Bench::new();
+    std::fs::write(bench.path("good.csv"), plain("t_s,wx_rad_s,wy_rad_s,wz_rad_s\n", 1.0)).unwrap();
+    // Every 40th sample of a motion of 10 rad/s.
+    let coarse =
+        motion(4000).into_iter().step_by(40).fold("t_s,wx_rad_s,wy_rad_s,wz_rad_s\n".to_owned(), |mut text, row| {
+            writeln!(text, "{:.2},{:.5},{:.5},{:.5}", row[0], row[1], row[2], row[3]).unwrap();
+            text
+        });
+    std::fs::write(bench.path("coarse.csv"), coarse).unwrap();
+    let estimate = |log: &str, more: &[&str]| bench.run(&[&["estimate", log, "--hidden", "x"], more].concat());
+    let diverged = estimate("good.csv", &["--inertia", "0.4,0.8,1", "--damping=-60"]);
+    assert!(diverged.code == Some(1) && diverged.says("diverged"), "{diverged:?}");
+    assert!(diverged.stdout.lines().all(|line| line.len() < 200), "{diverged:?}");
+    let long = estimate("coarse.csv", &["--inertia", "0.4,0.8,1"]);
+    assert!(long.code == Some(1) && long.says("steps-too-long"), "{long:?}");
+    let blind = estimate("good.csv", &["--inertia", "0.4,0.8,1", "--floor", "100"]);
+    assert!(blind.code == Some(1) && blind.says("never-observed"), "{blind:?}");
+    let misfit = estimate("good.csv", &["--inertia", "1,0.8,0.4"]);
+    assert!(misfit.stdout.contains("the body does not fit this motion"), "{misfit:?}");
+    let fits = estimate("good.csv", &["--inertia", "0.4,0.8,1"]).succeeded();
+    assert!(!fits.stdout.contains("does not fit") && !fits.stdout.contains("ambiguous"), "{fits:?}");
+}
+
+#[test]
+fn a_log_is_cut_by_times_by_a_file_and_by_its_free_motion() {
+    let bench = Bench::new();
+    let body = RigidBody::new(&Inertia::new(MOMENTS).unwrap());
+    // Throws at different rates, with hand motions of two seconds between them.
+    let (mut text, mut parts, mut time_s) = (String::from("t_s,wx_rad_s,wy_rad_s,wz_rad_s\n"), String::new(), 0.0);
+    let mut push = |rate: Vector3<f64>| {
+        writeln!(text, "{time_s:.2},{:.4},{:.4},{:.4}", rate.x, rate.y, rate.z).unwrap();
+        time_s += 0.01;
+        time_s - 0.01
+    };
+    for throw in 0..12_u32 {
+        let phase = f64::from(throw) * 1.7;
+        for tick in 0..200 {
+            let t = phase + f64::from(tick) * 0.01;
+            push(Vector3::new(
+                (7.0 * t).sin() * 5.0,
+                (4.3 * t + phase).cos() * 4.0,
+                (5.9 * t).sin() * 6.0 + (2.0 * t).cos(),
+            ));
+        }
+        let mut rate = Vector3::new(8.0 * phase.sin(), 3.0 + phase.cos(), 6.0 * (1.3 * phase).cos());
+        let begin_s = push(rate);
+        let end_s = (0..79).fold(begin_s, |_, _| {
+            rate = body.flow(&rate, &Vector3::zeros(), 0.01);
+            push(rate)
+        });
+        writeln!(parts, "{begin_s:.2},{end_s:.2}").unwrap();
+    }
+    std::fs::write(bench.path("uncut.csv"), text).unwrap();
+    std::fs::write(bench.path("parts.csv"), format!("begin,end\n{parts}")).unwrap();
+    let whole = bench.run(&["identify", "uncut.csv"]);
+    assert!(whole.code == Some(1) && whole.says("not-free"), "{whole:?}");
+    let first: Vec<&str> = parts.lines().next().unwrap().split(',').collect();
+    for (options, segments) in
+        [(&["--from", first[0], "--to", first[1]][..], 1), (&["--segments", "parts.csv"], 12), (&["--find-free"], 12)]
+    {
+        let found = bench.run(&[&["identify", "uncut.csv", "--json"], options].concat()).succeeded().json();
+        let log = &found["logs"][0];
+        assert_eq!(
+            (log["counts"]["segments"].as_u64(), log["parts_s"].as_array().unwrap().len()),
+            (Some(segments), segments as usize)
+        );
+        for (moment, expected) in found["body"]["inertia_kg_m2"].as_array().unwrap().iter().zip(MOMENTS) {
+            assert!((moment.as_f64().unwrap() / expected - 1.0).abs() < 0.02, "{options:?}: {found:#}");
+        }
+        let used_s = log["counts"]["used_s"].as_f64().unwrap();
+        assert!((used_s / (0.79 * segments as f64) - 1.0).abs() < 0.25, "{options:?}: {used_s}");
+        bench
+            .run(&[&["estimate", "uncut.csv", "--hidden", "z", "--inertia", "0.4,0.8,1"], options].concat())
+            .succeeded();
+    }
+    std::fs::write(bench.path("bad.csv"), "1,2\n3,2\n").unwrap();
+    for (options, code) in [
+        (&["--segments", "bad.csv"][..], "not-a-log"),
+        (&["--segments", "absent.csv"], "cannot-read"),
+        (&["--from", "1000"], "no-rows-used"),
+    ] {
+        let refused = bench.run(&[&["identify", "uncut.csv"], options].concat());
+        assert!(code == "no-rows-used" && refused.code == Some(1) || refused.says(code), "{options:?}: {refused:?}");
+    }
+    let hand: String = std::fs::read_to_string(bench.path("uncut.csv"))
+        .unwrap()
+        .lines()
+        .take(200)
+        .fold(String::new(), |text, line| text + line + "\n");
+    std::fs::write(bench.path("hand.csv"), hand).unwrap();
+    let refused = bench.run(&["identify", "hand.csv", "--find-free"]);
+    assert!(refused.code == Some(1) && refused.says("not-free"), "{refused:?}");
+}
