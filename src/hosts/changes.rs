@@ -88,7 +88,8 @@ mod tests {
         assert_eq!((first, late.len()), (0, 64 * CHANGE_WORDS));
         while let Some((first, words)) = hub.wanted_by(1) {
             let next = joined.take(first, bytemuck::cast_slice(&words));
-            assert_eq!(joined.take(first + 1, bytemuck::cast_slice(&words)), next, "beyond the end, or repeated");
+            assert_eq!(joined.take(first, bytemuck::cast_slice(&words)), next, "a message that arrives twice");
+            assert_eq!(joined.take(next + 1, bytemuck::cast_slice(&words)), next, "after a lost message");
             hub.requested(1, next);
         }
         assert_eq!(joined.take(0, bytemuck::cast_slice(&late)), 200, "a message that arrives late");
