@@ -35,16 +35,16 @@ pub struct Arguments {
     #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = seconds)]
     patience: f64,
     /// Continue if a device of another name answers during the run
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     allow_other_device: bool,
     /// Clock of the run: that of the host, or of the device, which sends a frame in each of its cycles
     #[arg(long, value_name = "CLOCK", default_value = "host")]
     pace: PaceBy,
     /// With `--pace device`, keep the pace of a silent device for this time, s
-    #[arg(long, value_name = "S", default_value_t = 5.0, value_parser = seconds)]
+    #[arg(long, value_name = "S", default_value_t = 5.0, value_parser = seconds, hide_short_help = true)]
     holdover: f64,
     /// With `--pace device`, then send no commands until the device is followed again (safe), or end the run (stop)
-    #[arg(long, value_name = "POLICY", default_value = "safe")]
+    #[arg(long, value_name = "POLICY", default_value = "safe", hide_short_help = true)]
     on_lost: LostPolicy,
     /// Print the line's counters as one JSON object (corotate/bridge/v1)
     #[arg(long)]
