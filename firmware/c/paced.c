@@ -33,7 +33,7 @@ static int64_t now_ns(void) {
 }
 static void line_send(const uint8_t *frame, size_t length) {
     ssize_t sent = is_cut ? 0 : is_udp ? sendto(line, frame, length, 0, (struct sockaddr *)&host, sizeof host) : write(line, frame, length);
-    (void)sent; /* what the line does not take is lost */
+    (void)sent; /* bytes that the line refuses are lost */
 }
 static size_t line_read(uint8_t *bytes, size_t length) {
     socklen_t size = sizeof host;

@@ -127,7 +127,7 @@ fn impossible_rates_are_refused() {
         (r#"sensor=[{body="leader",field="omega_rad_s",every_ticks=-1}]"#, "wrong-type"),
         (r#"sensor=[{body="leader",field="omega_rad_s"}]"#, "missing-key"),
         (r#"sensor=[{body="leader",field="omega_rad_s",every_tick=2}]"#, "unknown-key"),
-        (r#"sensor=[{body="nobody",field="omega_rad_s",every_ticks=2}]"#, "unknown-body"),
+        (r#"sensor=[{body="absent",field="omega_rad_s",every_ticks=2}]"#, "unknown-body"),
         (r#"sensor=[{body="leader",field="omega",every_ticks=2}]"#, "unknown-field"),
         (r#"sensor=[{body="leader",field="status",every_ticks=2}]"#, "unknown-field"),
         (r#"sensor=[{body="leader",field="tick",every_ticks=2}]"#, "unknown-field"),

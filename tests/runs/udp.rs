@@ -86,7 +86,7 @@ impl Service {
                     send(false, &bytes[..count]);
                 }
                 flying.retain(|(due, to_device, bytes)| {
-                    // What the socket does not take is lost.
+                    // A datagram that the socket refuses is lost.
                     let _ = match (*due <= now, to_device, host) {
                         (true, true, _) => far.send(bytes),
                         (true, false, Some(host)) => near.send_to(bytes, host),
