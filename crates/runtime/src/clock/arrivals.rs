@@ -33,6 +33,9 @@ pub struct ArrivalEstimator {
     /// Delay against the line from which on a window contradicts it, ns.
     contradiction_ns: f64,
     contradictions: usize,
+    /// The last measured drift, if there is one. It holds while the kept windows do not tell it: after a change of the phase or of the way the quartz
+    /// is the same.
+    drift: Option<f64>,
     /// Time and offset of the first frame; all others are relative to it.
     origin: Option<(u64, i64)>,
     filter: MinimumFilter,
@@ -49,6 +52,7 @@ impl ArrivalEstimator {
             window_ns: WINDOW_NS.max(WINDOW_FRAMES.saturating_mul(period_ns)),
             contradiction_ns,
             contradictions: 0,
+            drift: None,
             origin: None,
             filter: MinimumFilter::default(),
             line: OffsetLine::default(),
@@ -58,7 +62,7 @@ impl ArrivalEstimator {
     /// Forgets all frames.
     pub fn reset(&mut self) {
         self.filter.keep_last(0);
-        (self.origin, self.contradictions, self.line) = (None, 0, OffsetLine::default());
+        (self.origin, self.contradictions, self.line, self.drift) = (None, 0, OffsetLine::default(), None);
     }
 
     /// Returns the length of a window, ns.
@@ -105,18 +109,29 @@ impl ArrivalEstimator {
             self.contradictions = 0;
         }
         self.line = self.fit();
+        if self.filter.knows_drift() {
+            self.drift = Some(self.line.drift);
+        }
     }
 
-    /// Fits a line; windows in which every frame was delayed have a lower weight.
+    /// Fits a line; windows in which every frame was delayed have a lower weight. The line has the last drift while the windows with a
+    /// high weight do not span enough time for one.
     fn fit(&self) -> OffsetLine {
         let mut line = self.filter.line(DRIFT_MAX, |_| 1.0);
         for _ in 1..FITS {
-            let delay = |kept: &Observation| line.at(kept.at_ns) - kept.offset_ns;
-            let least_ns = self.filter.kept().iter().map(delay).fold(f64::INFINITY, f64::min);
-            let weight = |kept: &Observation| 1.0 / (1.0 + ((delay(kept) - least_ns) / SIMILAR_NS).powi(2));
-            line = self.filter.line(DRIFT_MAX, weight);
+            line = self.filter.line(DRIFT_MAX, self.weight(line));
         }
-        line
+        let Some(drift) = self.drift.filter(|_| !self.filter.tells_drift(self.weight(line))) else { return line };
+        let weight = self.weight(OffsetLine { offset_ns: 0.0, drift });
+        let newest = self.filter.newest_fast(weight);
+        newest.map_or(line, |kept| OffsetLine { offset_ns: kept.offset_ns - drift * kept.at_ns, drift })
+    }
+
+    /// Returns the weights of windows by their delay against a line.
+    fn weight(&self, line: OffsetLine) -> impl Fn(&Observation) -> f64 {
+        let delay = move |kept: &Observation| line.at(kept.at_ns) - kept.offset_ns;
+        let least_ns = self.filter.kept().iter().map(delay).fold(f64::INFINITY, f64::min);
+        move |kept| 1.0 / (1.0 + ((delay(kept) - least_ns) / SIMILAR_NS).powi(2))
     }
 }
 
@@ -200,6 +215,20 @@ mod tests {
         }
         let error_ns = world.error_ns(&estimator, 5000);
         assert!(error_ns.abs() < 3e3, "{error_ns} ns");
+    }
+
+    /// A way that is congested for longer than the earlier windows are kept, and then is not.
+    #[test]
+    fn a_change_of_the_way_keeps_the_drift() {
+        let (mut world, mut estimator) = (World::new(100e-6, 20e3, 7), ArrivalEstimator::new(PERIOD_NS, 1e5));
+        for k in 0..6000 {
+            let congested = if (3000..3600).contains(&k) { 400_000 } else { 0 };
+            estimator.take(k * PERIOD_NS, world.arrival(k) + congested);
+            let drift = estimator.at(world.sent_at(k) as u64).unwrap().drift;
+            assert!(k < 2500 || (drift - 100e-6).abs() < 60e-6, "frame {k}: {drift}");
+        }
+        let error_ns = world.error_ns(&estimator, 5999);
+        assert!(error_ns.abs() < 5e3, "{error_ns} ns");
     }
 
     /// A device that was switched off and on again has another phase.

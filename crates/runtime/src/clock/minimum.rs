@@ -75,17 +75,22 @@ impl MinimumFilter {
         &self.kept
     }
 
-    /// Returns the time from the first kept observation to the last, ns.
-    pub fn span_ns(&self) -> f64 {
-        match (self.kept.front(), self.kept.back()) {
-            (Some(first), Some(last)) => last.at_ns - first.at_ns,
-            _ => 0.0,
-        }
-    }
-
     /// Returns true if the kept observations span enough time for a drift.
     pub fn knows_drift(&self) -> bool {
-        self.span_ns() >= DRIFT_SPAN_NS
+        self.tells_drift(|_| 1.0)
+    }
+
+    /// Returns true if those of the least delayed, by these weights, span enough time for a drift.
+    pub fn tells_drift(&self, weight: impl Fn(&Observation) -> f64) -> bool {
+        let mut fast = self.kept.iter().filter(|kept| weight(kept) >= FAST);
+        let first = fast.next();
+        let last = fast.next_back().or(first);
+        first.zip(last).is_some_and(|(first, last)| last.at_ns - first.at_ns >= DRIFT_SPAN_NS)
+    }
+
+    /// Returns the newest of the least delayed observations, by these weights: it has drifted least.
+    pub fn newest_fast(&self, weight: impl Fn(&Observation) -> f64) -> Option<&Observation> {
+        self.kept.iter().rev().find(|kept| weight(kept) >= FAST)
     }
 
     /// Returns the least-squares line through the kept observations, with these weights. The drift is at most
@@ -99,8 +104,7 @@ impl MinimumFilter {
         }
         let (time_ns, offset_ns) = (sum(&|kept| kept.at_ns) / total, sum(&|kept| kept.offset_ns) / total);
         if !self.knows_drift() {
-            // Among equally fast observations the newest has drifted least.
-            let newest = self.kept.iter().rev().find(|kept| weight(kept) >= FAST);
+            let newest = self.newest_fast(weight);
             return OffsetLine { offset_ns: newest.map_or(offset_ns, |kept| kept.offset_ns), drift: 0.0 };
         }
         let variance = sum(&|kept| (kept.at_ns - time_ns).powi(2));
