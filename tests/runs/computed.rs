@@ -64,8 +64,16 @@ impl RoleFunction for Laws {
 
 #[test]
 fn a_stepped_run_equals_a_normal_run_bit_by_bit() {
-    for name in ["rigid-pair", "rigid-trio", "noisy-pair", "gyro-loss"] {
-        let create = || scenario(name, &["clock=in-process", "accept={}", "duration_s=3"]);
+    let sensor = r#"sensor=[{body="leader",field="omega_rad_s",every_ticks=3},{body="follower",field="omega_rad_s",every_ticks=2}]"#;
+    for (name, set) in [
+        ("rigid-pair", None),
+        ("rigid-trio", None),
+        ("noisy-pair", None),
+        ("gyro-loss", None),
+        ("rigid-pair", Some(sensor)),
+    ] {
+        let overrides: Vec<&str> = ["clock=in-process", "accept={}", "duration_s=3"].into_iter().chain(set).collect();
+        let create = || scenario(name, &overrides);
         let scenario = create();
         let mut steps = Steps::new(create()).unwrap();
         let mut laws = Laws::new(&scenario);

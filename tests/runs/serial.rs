@@ -313,6 +313,19 @@ fn in_lockstep_a_device_gives_the_bits_of_the_built_in_follower() {
     drop(device);
 }
 
+/// The bridge holds the fields of a device's measurement as a simulated body's.
+#[test]
+fn in_lockstep_a_device_with_a_slower_sensor_gives_the_same_bits() {
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let _device = Powered::reference(&cable.device.path);
+    let sensor = r#"sensor=[{body="follower",field="omega_rad_s",every_ticks=4,phase_ticks=1}]"#;
+    let slow = [&LOCKSTEP[..], &["--set", sensor, "--set", "accept={}"]].concat();
+    let with_device = run_with(&bench, "rigid-pair", &cable.host.path, &slow);
+    assert_eq!(with_device["state"]["hash"], bench.summary("rigid-pair", &slow)["state"]["hash"]);
+    assert_ne!(with_device["state"]["hash"], bench.summary("rigid-pair", &LOCKSTEP)["state"]["hash"]);
+}
+
 /// Requests are repeated until they are answered, and no tick is executed twice.
 #[test]
 fn in_lockstep_a_faulty_line_gives_the_same_bits() {

@@ -556,6 +556,59 @@ mod tests {
         assert!(accepts(&mut guard, 11, [0.502, 0.502, 0.501], 7), "it moves again");
     }
 
+    fn accepts_held(guard: &mut PlausibilityCheck<3>, tick: u64, values: [f64; 3], held: u64) -> bool {
+        let stamp = Stamp { tick, generation: 1, ..Stamp::default() };
+        guard.accepts_held(&stamp, &values, (7, held), |bounds, i, _, ticks| bounds.slew_per_tick[i] * ticks)
+    }
+
+    /// The next new value may differ by what the body can do in the whole time.
+    #[test]
+    fn a_held_component_does_not_shorten_the_time_since_its_last_value() {
+        let mut guard = guard();
+        assert!(accepts(&mut guard, 0, [0.0; 3], 7));
+        for tick in 1..10 {
+            assert!(accepts_held(&mut guard, tick, [0.0, 0.01 * tick as f64, 0.0], 0b001), "tick {tick}");
+        }
+        assert!(!accepts(&mut guard.clone(), 10, [0.12, 0.1, 0.0], 7), "too fast for ten ticks");
+        assert!(!accepts(&mut guard.clone(), 10, [0.1, 0.05, 0.0], 7), "too fast for one tick");
+        assert!(accepts(&mut guard, 10, [0.1, 0.1, 0.0], 7));
+    }
+
+    #[test]
+    fn an_impossible_held_value_is_rejected_with_its_reason() {
+        let mut guard = guard();
+        assert!(accepts(&mut guard, 0, [0.0; 3], 7));
+        for (value, reason) in [(f64::NAN, Refusal::NotFinite), (2.1, Refusal::OutOfRange), (0.5, Refusal::TooFast)] {
+            assert!(!accepts_held(&mut guard, 1, [value, 0.0, 0.0], 0b001), "{value}");
+            assert_eq!(guard.refusal(), reason, "{value}");
+        }
+        assert!(!accepts_held(&mut guard, 1, [0.0, 0.5, 0.0], 0b001), "new components are checked too");
+    }
+
+    #[test]
+    fn held_values_are_not_stuck_ones() {
+        let mut guard = PlausibilityCheck::new(Bounds { repeats: 3, ..guard().bounds });
+        let held =
+            |guard: &mut _, ticks: std::ops::Range<u64>| ticks.filter(|k| accepts_held(guard, *k, [0.5; 3], 7)).count();
+        assert!(accepts(&mut guard, 0, [0.5; 3], 7));
+        assert_eq!(held(&mut guard, 1..30), 29);
+        let repeated = (1..6).filter(|n| accepts(&mut guard, 30 * n, [0.5; 3], 7)).count();
+        assert_eq!(repeated, 3, "new values that repeat are");
+    }
+
+    /// A driven body beyond its range, whose sensor is slow: the prediction goes on in between.
+    #[test]
+    fn a_motion_is_followed_through_ticks_without_a_new_value() {
+        let flow = |from: &[f64; 1]| [from[0] + 0.1];
+        let mut check = MotionCheck::<1>::default();
+        let confirmed = (0..60).find(|tick| {
+            let value = [0.1 * *tick as f64];
+            if tick % 4 == 0 { check.is_consistent(*tick, &value, &[1e-9], flow) } else { check.coast(*tick, flow) }
+        });
+        assert_eq!(confirmed, Some(4 * SUSPECT_SAMPLES), "as many new values as without held ones");
+        assert!(!check.coast(90, flow) && !check.active(), "a gap ends the check");
+    }
+
     #[test]
     fn a_rejected_sample_has_its_reason() {
         let mut guard = PlausibilityCheck::new(Bounds { repeats: 2, ..guard().bounds });
