@@ -136,9 +136,9 @@ static enum event missing_command(void) {
 
 /* ---- the run --------------------------------------------------------------------------------------------------------------- */
 static struct {
-    bool known, begun, greeted, stopped, manual_rearm, lets_one_pass;
+    bool known, begun, greeted, stopped, manual_rearm, is_late;
     uint64_t number, period_ns, last_tick, tick, next;
-    unsigned long long cycles, slips, overslept, behind;
+    unsigned long long cycles, slips, overslept, late, ahead;
     enum event event;
     uint32_t echo;
     uint8_t outputs[64 + 56];
@@ -181,11 +181,9 @@ static void on_tick(struct reader *from, uint32_t sequence) {
     if (!run.begun || tick >= run.next) {
         requests[tick % 2] = (struct request){.waits = true, .present = present, .sequence = sequence, .tick = tick};
         if (present) memcpy(requests[tick % 2].command, bytes, sizeof requests->command);
-        run.behind = 0;
+        run.is_late = false;
     } else if (tick == run.tick) {
-        run.echo = sequence, answer(), send_frame(); /* the cycle of this tick has passed */
-        /* A host that does not follow drifts away: after four late requests in a row a cycle passes without a tick. */
-        if (++run.behind == 4) run.lets_one_pass = true, run.behind = 0;
+        run.echo = sequence, answer(), send_frame(), run.is_late = true; /* the cycle of this tick has passed */
     }
 }
 
@@ -217,12 +215,15 @@ static void cycle(void) {
     /* Of two requests before the first cycle, the later one is for this cycle. */
     if (begins) run.next = requests[!requests[0].waits || is_later(1)].tick, run.begun = true;
     run.cycles++;
-    if (run.lets_one_pass) return run.lets_one_pass = false, move();
+    /* A host that does not follow drifts away: four late requests in a row pass over a cycle, four early ones a tick. */
+    run.late = run.is_late ? run.late + 1 : 0, run.is_late = false;
+    run.ahead = !is_asked(run.next) && (is_later(0) || is_later(1)) ? run.ahead + 1 : 0;
+    if (run.late == 4) return run.late = 0, move();
     run.slips += !is_asked(run.next) && !is_cut;
-    for (; !is_asked(run.next) && (is_later(0) || is_later(1)); run.next++) missing_command(), move();
-    struct request *request = &requests[run.next % 2];
-    run.event = take_command(request), run.echo = request->sequence, run.tick = run.next++, request->waits = false;
-    measure(), answer(), move();
+    if (run.ahead == 4) run.ahead = 0, run.next++, missing_command(), move();
+    run.event = take_command(&requests[run.next % 2]);
+    if (is_asked(run.next)) run.echo = requests[run.next % 2].sequence, requests[run.next % 2].waits = false;
+    run.tick = run.next++, measure(), answer(), move();
 }
 
 /* Decodes a block in place and handles its message if the CRC is valid. */

@@ -189,10 +189,10 @@ impl Line {
     /// Returns the time at which the bytes that were read last arrived, on this host's monotonic clock, ns: of a datagram
     /// that of its arrival in the system, of a stream the present.
     pub fn arrived_ns(&self) -> u64 {
-        let now_ns = raw_ns();
-        let Some(socket) = self.port.as_ref().filter(|_| !self.is_stream()) else { return now_ns };
-        let age_ns = stamp(socket).and_then(|stamp_ns| realtime_ns().checked_sub(stamp_ns));
-        now_ns - age_ns.filter(|age_ns| *age_ns < AGE_MAX_NS).unwrap_or(0)
+        let socket = self.port.as_ref().filter(|_| !self.is_stream());
+        let age_ns = socket.and_then(stamp).and_then(|stamp_ns| realtime_ns().checked_sub(stamp_ns));
+        // After the age: if the process is held up between the two, the arrival appears late and never early.
+        raw_ns() - age_ns.filter(|age_ns| *age_ns < AGE_MAX_NS).unwrap_or(0)
     }
 
     /// Sends a frame after what is left of the previous one. Returns false if the rest of the previous frame was
