@@ -378,13 +378,15 @@ impl Rig for RigidBodyRig {
             }
         };
         let worst = |worst: f64, error: f64| if error > worst || error.is_nan() { error } else { worst };
-        let value = |metric| match metric {
-            0 => (1..self.bodies.len()).map(follower).fold(0.0, worst),
-            1 => distance(estimate.map(|estimate| estimate.omega_rad_s.into()), leader),
-            _ => distance(estimate.map(|estimate| estimate.coefficients.into()), Some(self.inertia.coefficients())),
-        };
         let (first, end) = self.scored();
-        (first..end).for_each(|metric| out[metric - first] = value(metric));
+        if first == 0 {
+            out[0] = (1..self.bodies.len()).map(follower).fold(0.0, worst);
+            out[1] = distance(estimate.map(|estimate| estimate.omega_rad_s.into()), leader);
+        }
+        if end == 3 {
+            let learned = estimate.map(|estimate| estimate.coefficients.into());
+            out[2 - first] = distance(learned, Some(self.inertia.coefficients()));
+        }
     }
 
     fn isolated(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
