@@ -89,6 +89,13 @@ fn tables_of_many_forms_give_the_body_at_the_first_try() {
         ),
         ("euler.csv", in_deg("seconds_elapsed,roll_rate_dps,pitch_rate_dps,yaw_rate_dps\n").into()),
         ("capitals.CSV", plain("TIME,WX,WY,WZ\n", 1.0).into()),
+        ("other-header.csv", plain("t;wx;wy;wz\n", 1.0).into()),
+        ("subscripts.txt", table("# Rate: 415 Hz\n#time      ωₓ (rad/s)      ωᵧ (rad/s)      ωᶻ (rad/s)\n", 1.0, |t, rates| {
+            format!("{t:.2}      {}", rates.join("      "))
+        }).into()),
+        ("micro-rates.csv", plain("t_s,P (µrad/s),Q (µrad/s),R (µrad/s)\n", 1e-6).into()),
+        ("minutes.csv", table("Zeit,Drehrate x,Drehrate y,Drehrate z\n", 1.0, |t, r| format!("59:{t:05.2},{}", r.join(","))).into()),
+        ("milliseconds.csv", table("time,wx,wy,wz\n", 1.0, |t, rates| format!("{:.1},{}", 1.7e12 + t * 1e3, rates.join(","))).into()),
     ];
     for (name, bytes) in forms {
         std::fs::write(bench.path(name), bytes).unwrap();
@@ -99,6 +106,11 @@ fn tables_of_many_forms_give_the_body_at_the_first_try() {
             assert!((moment.as_f64().unwrap() - expected).abs() < 0.01, "{name}: {found:#}");
         }
     }
+    let commas = plain("\"Time, s\",\"IMU, X\",\"IMU, Y\",\"IMU, Z\"\n", 1.0);
+    std::fs::write(bench.path("commas.csv"), commas).unwrap();
+    assert!(bench.run(&["identify", "commas.csv"]).says("no-such-column"));
+    let found = bench.run(&["identify", "commas.csv", "--json", "--rates", "2,3,4"]).succeeded().json();
+    assert!((found["body"]["inertia_kg_m2"][0].as_f64().unwrap() - 0.4).abs() < 0.01, "{found:#}");
     // The options for what is not found out.
     let counted =
         table("PacketCounter,IMU A,IMU B,IMU C\n", 1.0, |t, rates| format!("{:.0},{}", t * 100.0, rates.join(",")));
@@ -152,6 +164,8 @@ fn units_that_are_impossible_or_not_known_are_refused_by_name() {
         ("slow-deg.csv", slow(deg, 1.0), &["--rate-unit deg/s", "implausible-unit"]),
         ("slow-rpm.csv", slow(rpm, 1.0), &["--rate-unit rpm", "implausible-unit"]),
         ("slow-ms.csv", slow(1.0, 1e3), &["implausible-unit"]),
+        ("slow-half.csv", slow(0.5, 1.0), &["5.000e-1 times", "implausible-unit"]),
+        ("minutes-as-s.csv", slow(1.0, 1.0 / 60.0), &["6.000e1 times", "implausible-unit"]),
         (
             "lost.csv",
             in_deg("t_s,Gyro X (\u{fffd}/s),Gyro Y (\u{fffd}/s),Gyro Z (\u{fffd}/s)\n"),
@@ -188,6 +202,21 @@ fn units_that_are_impossible_or_not_known_are_refused_by_name() {
 #[test]
 fn a_motion_that_is_not_free_gives_no_body_in_a_short_log_too() {
     let bench = Bench::new();
+    let wave = |t: f64| [t, 0.0, 0.0, 5.0 * (2.0 * t).sin()];
+    for (name, rates) in [
+        ("swing.csv", wave as fn(f64) -> [f64; 4]),
+        ("constant.csv", |t| [t, 1.0, 2.0, 3.0]),
+        ("slowing.csv", |t| [t, 5.0 * (-t).exp(), 3.0 * (-t).exp(), 4.0 * (-t).exp()]),
+    ] {
+        let mut text = String::from("time_s,wx_rad_s,wy_rad_s,wz_rad_s\n");
+        for [t, x, y, z] in (0..300).map(|tick| rates(f64::from(tick) * 0.01)) {
+            writeln!(text, "{t:.2},{x:.4},{y:.4},{z:.4}").unwrap();
+        }
+        std::fs::write(bench.path(name), text).unwrap();
+        let refused = bench.run(&["identify", name]);
+        assert!(refused.code == Some(1) && refused.says("one-axis"), "{name}: {refused:?}");
+        assert!(!refused.stdout.contains("inertia_kg_m2"), "{name}: {refused:?}");
+    }
     for (name, samples, step_s) in [("short.csv", 60, 0.05), ("long.csv", 3000, 0.01), ("fast.csv", 100, 0.02)] {
         let mut text = String::from("time_s,wx_rad_s,wy_rad_s,wz_rad_s\n");
         for tick in 0..samples {
@@ -262,12 +291,21 @@ fn a_log_is_cut_by_times_by_a_file_and_by_its_free_motion() {
     }
     std::fs::write(bench.path("uncut.csv"), text).unwrap();
     std::fs::write(bench.path("parts.csv"), format!("begin,end\n{parts}")).unwrap();
+    let numbered = parts.lines().enumerate().map(|(number, part)| format!("{number},{part},,free\n"));
+    std::fs::write(
+        bench.path("numbered.csv"),
+        format!("segment,start,end,keep,comment\n{}", numbered.collect::<String>()),
+    )
+    .unwrap();
     let whole = bench.run(&["identify", "uncut.csv"]);
     assert!(whole.code == Some(1) && whole.says("not-free"), "{whole:?}");
     let first: Vec<&str> = parts.lines().next().unwrap().split(',').collect();
-    for (options, segments) in
-        [(&["--from", first[0], "--to", first[1]][..], 1), (&["--segments", "parts.csv"], 12), (&["--find-free"], 12)]
-    {
+    for (options, segments) in [
+        (&["--from", first[0], "--to", first[1]][..], 1),
+        (&["--segments", "parts.csv"], 12),
+        (&["--segments", "numbered.csv"], 12),
+        (&["--find-free"], 12),
+    ] {
         let found = bench.run(&[&["identify", "uncut.csv", "--json"], options].concat()).succeeded().json();
         let log = &found["logs"][0];
         assert_eq!(
@@ -284,8 +322,10 @@ fn a_log_is_cut_by_times_by_a_file_and_by_its_free_motion() {
             .succeeded();
     }
     std::fs::write(bench.path("bad.csv"), "1,2\n3,2\n").unwrap();
+    std::fs::write(bench.path("names.csv"), "a,b,c\n1,2,3\n").unwrap();
     for (options, code) in [
         (&["--segments", "bad.csv"][..], "not-a-log"),
+        (&["--segments", "names.csv"], "not-a-log"),
         (&["--segments", "absent.csv"], "cannot-read"),
         (&["--from", "1000"], "no-rows-used"),
     ] {

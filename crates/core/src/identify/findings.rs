@@ -22,9 +22,18 @@ const SCALES: [f64; 7] = [
     core::f64::consts::TAU / 60.0,
     core::f64::consts::TAU,
 ];
-/// The least ratio of the unexplained parts at the wrong and at the right scale, and the largest unexplained part at the right one.
+/// The least ratio of the unexplained parts at the wrong and at the right scale, the largest unexplained part at the right one, and
+/// the least at the wrong one where the right one is not that of a unit.
 const BETTER: f64 = 4.0;
 const WELL: f64 = 0.02;
+const ILL: f64 = 2e-4;
+/// The least ratio of the unexplained parts where the right scale is not that of a unit.
+const FAR: f64 = 10.0;
+/// The factor by which a scale differs from another.
+const APART: f64 = 1.25;
+/// The parts of the mean square of the rates, about another axis than the first, up to which a body turns about one axis: in any log,
+/// and in one where it is below four times the noise.
+const ONE_AXIS: [f64; 2] = [1e-8, 1e-3];
 /// The standard deviation from which a coefficient counts as unknown (no body's exceeds 1), and, where that is
 /// unknown, the least ratio of its effect on the rate to the residual.
 const UNKNOWN: f64 = 0.3;
@@ -64,6 +73,22 @@ pub enum Finding {
         /// The total angle.
         turn_rad: f64,
     },
+    /// The body turned about one axis.
+    #[error(
+        "the body turned about one axis only, {} in the sensor's axes, which tells nothing about its moments; log a motion about \
+         all axes",
+        three(direction)
+    )]
+    OneAxis {
+        /// The axis.
+        direction: Vector3<f64>,
+    },
+    /// Motions in other units look alike.
+    #[error(
+        "the units were assumed, and this motion would be that of a body in other units too; make sure of them, or give them with \
+         --rate-unit and --time-unit"
+    )]
+    Units,
     /// The motion does not depend on one coefficient.
     #[error(
         "a{} is not known by this log: what it does to the rate about {} ({excitation_rad_s:.2e} rad/s) is too little beside \
@@ -192,6 +217,8 @@ impl From<&Finding> for &'static str {
             Finding::Short { .. } => "log-too-short",
             Finding::FewPieces { .. } => "few-pieces",
             Finding::Still { .. } => "hardly-a-motion",
+            Finding::OneAxis { .. } => "one-axis",
+            Finding::Units => "units-assumed",
             Finding::Unexcited { .. } => "unexcited",
             Finding::Sphere => "sphere",
             Finding::Symmetric { .. } => "symmetric",
@@ -214,6 +241,7 @@ impl Finding {
             self,
             Self::Short { .. }
                 | Self::Still { .. }
+                | Self::OneAxis { .. }
                 | Self::Unexcited { .. }
                 | Self::Scaled { .. }
                 | Self::NotFree { whole: false, .. }
@@ -226,6 +254,7 @@ impl Finding {
             self,
             Self::Short { .. }
                 | Self::Still { .. }
+                | Self::OneAxis { .. }
                 | Self::Indistinct { .. }
                 | Self::Scaled { .. }
                 | Self::NotFree { whole: true, .. }
@@ -252,10 +281,16 @@ pub fn findings(
     if summary.samples < FEW_SAMPLES {
         found.push(Finding::Short { samples: summary.samples });
     }
+    found.extend(wrong_scale(motion).map(|factor| Finding::Scaled { factor }));
     if summary.turn_rad < 1.0 {
         found.push(Finding::Still { turn_rad: summary.turn_rad });
     }
-    found.extend(wrong_scale(motion).map(|factor| Finding::Scaled { factor }));
+    let noise = 4.0 * motion.noise().max();
+    let is_one =
+        |[first, next]: [f64; 2]| next <= ONE_AXIS[0] * first || (next <= noise && next <= ONE_AXIS[1] * first);
+    if let Some((_, direction)) = motion.turns().filter(|(squares, _)| is_one(*squares)) {
+        found.push(Finding::OneAxis { direction });
+    }
     if let Some(fit) = axes {
         found.extend(body.and_then(|body| not_free(motion, fit, body)));
         about_axes(fit, &mut found);
@@ -271,18 +306,45 @@ pub fn findings(
     found
 }
 
-/// Returns the factor of all rates, or times, at which the motion is that of a free body, if it is not 1 and that of a unit.
+/// Returns the factor of all rates, or times, at which the motion is that of a free body, if it is not 1: that of a unit, or the one
+/// at which the coefficients' identity holds.
 pub fn wrong_scale(motion: &Motion) -> Option<f64> {
     let scatter = motion.total().scatter.diagonal();
     let noise = motion.noise().sum() * motion.total().samples as f64 / scatter.fixed_rows::<3>(0).sum();
+    // Rates of 1/k have the coefficients k a, so that a1 + a2 + a3 + a1 a2 a3 / k² = 0 in place of the identity.
+    let identity =
+        motion.about_known_axes(true).map(|fit| libm::sqrt(-fit.coefficients.product() / fit.coefficients.sum()));
+    let identity = identity.filter(|factor| factor.is_finite() && !(1.0 / APART..APART).contains(factor));
     let better = |whole: bool| {
         // Where no body fits at all, everything is unexplained.
         let own = motion.unexplained(whole, 1.0).unwrap_or(1.0);
-        let scales = SCALES.iter().filter_map(|factor| Some((motion.unexplained(whole, *factor)?, *factor)));
-        let (least, factor) = scales.min_by(|first, second| first.0.total_cmp(&second.0))?;
-        (least < WELL && own > BETTER * least && own > 2.0 * noise).then_some(factor)
+        let least = |scales: &[f64]| {
+            let parts = scales.iter().filter_map(|factor| Some((motion.unexplained(whole, *factor)?, *factor)));
+            parts.min_by(|first, second| first.0.total_cmp(&second.0))
+        };
+        let is_wrong = |least: f64| least < WELL && own > BETTER * least && own > 2.0 * noise;
+        let unit = least(&SCALES).filter(|(least, _)| is_wrong(*least));
+        let scale = identity
+            .and_then(|factor| least(&[factor]))
+            .filter(|(least, _)| is_wrong(*least) && own > FAR * least && own > ILL);
+        let found = match (unit, scale) {
+            // A unit that fits as well is the more likely one.
+            (Some(unit), Some(scale)) => Some(if unit.0 < BETTER * scale.0 + noise { unit } else { scale }),
+            (unit, scale) => unit.or(scale),
+        };
+        let (found, factor) = found?;
+        // A body with two equal moments has no scale.
+        let alike = least(&[factor * APART, factor / APART]).is_some_and(|(next, _)| next < BETTER * found);
+        (!alike).then_some(factor)
     };
     better(false).or_else(|| better(true))
+}
+
+/// Returns true if the motion is that of a body in deg/s or ms too, as with two equal moments.
+pub fn has_no_scale(motion: &Motion) -> bool {
+    let part = |factor: f64| motion.unexplained(false, factor).unwrap_or(1.0);
+    let own = BETTER * part(1.0);
+    [SCALES[0], SCALES[2]].into_iter().any(|factor| part(factor) < own)
 }
 
 /// Returns true if the fit leaves a part of a rate that is neither noise nor negligible.

@@ -25,7 +25,7 @@ mod tensor;
 
 pub use axes::AxesFit;
 #[cfg(feature = "std")]
-pub use findings::{Finding, findings, wrong_scale};
+pub use findings::{Finding, findings, has_no_scale, wrong_scale};
 #[cfg(feature = "std")]
 pub use free::free_stretches;
 pub use motion::{Motion, MotionSummary, Sample};

@@ -6,7 +6,7 @@
 //! constants of integration are unknown. This module must not store a sample longer than its two neighbours, nor join
 //! a motion across a gap.
 
-use nalgebra::{SMatrix, SVector, Vector3};
+use nalgebra::{Matrix3, SMatrix, SVector, SymmetricEigen, Vector3};
 
 /// The number of features: ω, the integrals of ω_x², ω_y², ω_z², ω_y ω_z, ω_z ω_x, ω_x ω_y, and the integral of ω.
 pub(super) const FEATURES: usize = 12;
@@ -24,6 +24,9 @@ pub(super) const GROUPS: usize = 20;
 const PIECE_TURN_RAD: f64 = 8.0 * core::f64::consts::PI;
 /// The least number of samples in a piece, because its constants of integration are unknown.
 const PIECE_SAMPLES: u64 = 4;
+
+/// The maximum number of sweeps of the eigenvalue solver.
+pub(super) const SWEEPS: usize = 200;
 
 /// The part of white noise in differences of third order.
 const THIRD_POWER: f64 = 20.0;
@@ -82,6 +85,8 @@ pub struct Motion {
     in_row: usize,
     /// The sum of the squares of the third ones, and their number.
     third: (Vector3<f64>, u64),
+    /// Σ ω ωᵀ.
+    square: Matrix3<f64>,
 }
 
 /// A summary of a log.
@@ -111,6 +116,7 @@ impl Default for Motion {
             differences: [Vector3::zeros(); 4],
             in_row: 0,
             third: (Vector3::zeros(), 0),
+            square: Matrix3::zeros(),
         }
     }
 }
@@ -138,6 +144,7 @@ impl Motion {
         }
         self.summary.fastest_rad_s = self.summary.fastest_rad_s.max(sample.rate_rad_s.norm());
         self.summary.samples += 1;
+        self.square += sample.rate_rad_s * sample.rate_rad_s.transpose();
         let mut value = sample.rate_rad_s;
         for difference in &mut self.differences {
             value -= core::mem::replace(difference, value);
@@ -172,6 +179,18 @@ impl Motion {
     /// Returns the variance of white noise in each rate, (rad/s)²: what differences of third order leave of the motion.
     pub(super) fn noise(&self) -> Vector3<f64> {
         self.third.0 / (THIRD_POWER * self.third.1.max(1) as f64)
+    }
+
+    /// Returns the mean square of the rate about the axis with the most, then the next, (rad/s)², with the direction of the first.
+    pub(super) fn turns(&self) -> Option<([f64; 2], Vector3<f64>)> {
+        let mean = self.square / self.summary.samples.max(1) as f64;
+        if !mean.iter().all(|entry| entry.is_finite()) {
+            return None;
+        }
+        let SymmetricEigen { eigenvalues, eigenvectors } = SymmetricEigen::try_new(mean, f64::EPSILON, SWEEPS)?;
+        let most = eigenvalues.imax();
+        let next = (0..3).filter(|axis| *axis != most).map(|axis| eigenvalues[axis]).fold(0.0, f64::max);
+        Some(([eigenvalues[most], next], eigenvectors.column(most).into_owned()))
     }
 
     /// Returns the sums over all pieces.

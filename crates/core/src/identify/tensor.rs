@@ -6,7 +6,7 @@
 //! J), the reference of the sum. So the smallest of six generalised eigenvalues is computed repeatedly: total least
 //! squares, which noise does not bias towards a sphere. The fit must not depend on a given noise or alignment.
 
-use super::motion::{FEATURES, Motion, PRODUCTS, Sums, TURNS};
+use super::motion::{FEATURES, Motion, PRODUCTS, SWEEPS, Sums, TURNS};
 use super::spread;
 use nalgebra::{Cholesky, Matrix3, Matrix6, SMatrix, SVector, SymmetricEigen, Vector3, Vector6};
 
@@ -15,8 +15,6 @@ const ROUNDS: usize = 40;
 const SETTLED: f64 = 1e-9;
 /// The smallest moment used in a weight, as a part of the largest.
 const LEAST_MOMENT: f64 = 1e-3;
-/// The maximum number of sweeps of the eigenvalue solver.
-const SWEEPS: usize = 200;
 
 /// A linear map from the features to the conserved vector.
 type Row = SMatrix<f64, 3, FEATURES>;

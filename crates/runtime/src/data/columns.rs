@@ -3,6 +3,7 @@
 use super::form::{DataError, Meaning, Options};
 use super::plausible::since_1970;
 use super::stamp::Stamp;
+use super::table::number;
 use super::unit::{RateUnit, TimeUnit};
 use std::path::Path;
 
@@ -11,22 +12,24 @@ const STAMPS: [&str; 3] = [
     "headerstamp sampletimefine",
     "elapsed elapsedtime timeelapsed",
     "time t timestamp stamp loggingtime systemtime unixtime devicetime sensortime datetime timeboot timestampsample rostime \
-     utc clock epoch",
+     utc clock epoch simtime runtime reltime trel tow gpstow zeit temps tiempo tempo czas",
 ];
 /// Words that make a name with another of them a time stamp, and words that prevent it.
 const STAMP_WORDS: &str = "time timestamp stamp elapsed";
 const NO_STAMP_WORDS: &str = "delta exposure zone interval diff of";
 /// Names of an angular velocity, without unit and axis; `g` as in ax, ay, az, gx, gy, gz.
 const RATES: &str = "w g ω omega gyro gyr gyros gyroscope rate rates bodyrate bodyrates angularvelocity angularrate angvel \
-                     rotationrate av angularspeed gyrorate gyroraw gyroadc motionrotationrate";
+                     rotationrate av avel angularspeed gyrorate gyroraw gyroadc motionrotationrate turnrate rotrate angrate anglerate \
+                     drehrate winkelgeschwindigkeit vitesseangulaire velocidadangular 角速度";
 /// Words that make a longer name that of an angular velocity, and parts of words that do.
 const RATE_WORDS: &str = "w omega gyr gyro ω";
-const RATE_PARTS: &str = "gyro angularvelocity angularrate angvel angularspeed rotationrate bodyrate omega";
+const RATE_PARTS: &str =
+    "gyro angularvelocity angularrate angvel angularspeed rotationrate rotrate bodyrate angrate anglerate omega";
 /// Words of quantities that are related to an angular velocity.
 const NO_RATE_WORDS: &str = "bias offset cov covariance std stddev var variance accel acc acceleration linear mag temp temperature \
                              setpoint desired des target cmd command ref error noise";
 /// Words beside a unit that make it another one.
-const MODIFIERS: &str = "centi deci micro nano kilo per min minute h hr hour day ms us s2 sq squared 2s ns ss";
+const MODIFIERS: &str = "centi deci micro nano kilo per min minute h hr hour day s ms us s2 sq squared 2s ns ss";
 /// Parts of words that look like a unit of angular velocity, and words that look like a unit of time.
 const LIKE_RATE: &str = "deg rad dps rpm rps grad gon lsb hz counts arcsec °";
 const LIKE_TIME: &str = "min mins minute minutes h hr hrs hour hours days tick ticks cycles frames samples jiffies ds";
@@ -47,9 +50,20 @@ enum Claim<U> {
     Unknown(String),
 }
 
+/// Replaces the index of a name that is set below or above the line.
+fn plain(letter: char) -> char {
+    match letter {
+        'ₓ' | 'ˣ' => 'x',
+        'ᵧ' | 'ʸ' => 'y',
+        'ᶻ' => 'z',
+        '₀'..='₃' => char::from(b'0' + (u32::from(letter) - u32::from('₀')) as u8),
+        letter => letter,
+    }
+}
+
 /// Returns the words of a name in lower case; a word also begins at a capital, as in `TimeUS` and `IMUGyroX`.
 fn words(name: &str) -> Vec<String> {
-    let letters: Vec<char> = name.chars().collect();
+    let letters: Vec<char> = name.chars().map(plain).collect();
     let mut words = vec![String::new()];
     for (at, letter) in letters.iter().enumerate() {
         let before = at.checked_sub(1).map(|at| letters[at]);
@@ -100,12 +114,18 @@ fn split<U>(name: &str, parse: fn(&str) -> Option<U>, is_like: fn(&str) -> bool)
     }
     for length in (1..=4.min(words.len())).rev() {
         for at in (0..=words.len() - length).rev() {
-            // A digit is an index.
+            // A letter is an axis, a digit an index.
+            if length > 1 && words[at].len() == 1 {
+                continue;
+            }
             let run = words[at..at + length].iter();
             let text: String = run.map(|word| if word.parse::<u32>().is_ok() { "-" } else { word.as_str() }).collect();
             let Some(unit) = parse(&text).filter(|_| !text.contains('-')) else { continue };
             let beside = [at.checked_sub(1).map(|at| &words[at]), words.get(at + length)];
-            if beside.into_iter().flatten().any(|word| listed(MODIFIERS, word)) || plain.contains(['^', '²']) {
+            // As in `deg_s_100`; a smaller number is an index.
+            let factor = |word: &String| word.parse::<u32>().is_ok_and(|number| number > 9);
+            let modified = |word: &String| listed(MODIFIERS, word) || factor(word);
+            if beside.into_iter().flatten().any(modified) || plain.contains(['^', '²']) {
                 return (Claim::Unknown(words[at.saturating_sub(1)..].join(" ")), words);
             }
             words.drain(at..at + length);
@@ -185,6 +205,12 @@ fn rate_name(name: &str, gyro: bool) -> Option<RateName> {
     let (claim, mut words) = rate_claim(name);
     if words.iter().any(|word| listed(NO_RATE_WORDS, word)) {
         return None;
+    }
+    // As aircraft have them.
+    if let ([word], false) = (&words[..], matches!(claim, Claim::Unknown(_)))
+        && let Some(axis) = ["p", "q", "r"].iter().position(|letter| letter == word)
+    {
+        return Some(RateName { rank: 3, stem: "pqr".to_owned(), axis: Axis::Letter(axis) });
     }
     let digit = |word: &str| word.parse::<usize>().ok().filter(|digit| word.len() == 1 && *digit < 4);
     // True for roll, pitch and yaw.
@@ -283,7 +309,7 @@ pub fn find(
     assumed.extend(given_rate.is_none().then_some("rate"));
     let time_name = time.map_or_else(|| "the row's number".to_owned(), |index| names[index].clone());
     let meaning = Meaning {
-        time: (time_name, given_time.or_else(|| since_1970(stamp.parse().ok()?)).unwrap_or(TimeUnit::Seconds)),
+        time: (time_name, given_time.or_else(|| since_1970(number(&stamp, true)? as i64)).unwrap_or(TimeUnit::Seconds)),
         rates: (rates.map(name), given_rate.unwrap_or(RateUnit::RadiansPerSecond)),
         assumed,
         found: String::new(),
@@ -352,7 +378,10 @@ impl Search<'_> {
             (_, Some(index)) => Ok((Some(*index), None)),
             _ => {
                 let count = if of_best.is_empty() { "no column is" } else { "more than one column is" };
-                let remedy = format!("name the column of time, or give the rows per second{}", self.unnamed());
+                let remedy = format!(
+                    "name the column of time (--time), or give the rows per second (--rate-hz){}",
+                    self.unnamed()
+                );
                 Err(self.refuse(format!("{count} known to be time"), &remedy))
             }
         }
@@ -387,7 +416,8 @@ impl Search<'_> {
             if rate.is_none() && self.options.needed[axis] {
                 let letter = ["x", "y", "z"][axis];
                 let reason = format!("no column is known to be the rate about {letter}");
-                return Err(self.refuse(reason, &format!("name the three columns of the rates{}", self.unnamed())));
+                let remedy = "name the three columns of the rates, or their numbers (--rates)";
+                return Err(self.refuse(reason, &format!("{remedy}{}", self.unnamed())));
             }
         }
         Ok(rates)
@@ -442,7 +472,7 @@ impl Search<'_> {
 
     fn both(&self, first: usize, second: usize) -> DataError {
         let reason = format!("`{}` and `{}` may both be a rate", self.names[first], self.names[second]);
-        self.refuse(reason, "name the three columns of the rates")
+        self.refuse(reason, "name the three columns of the rates, or their numbers (--rates)")
     }
 
     /// Returns the unit of the rates, if an option or their names give it.
@@ -452,15 +482,17 @@ impl Search<'_> {
         }
         let mut units = Vec::new();
         for index in rates.iter().flatten() {
-            let remedy = "--rate-unit rad/s, deg/s, mdps, mrad/s, rpm or rev/s, or --rate-scale and the rad/s per unit";
+            let remedy =
+                "--rate-unit with one such as rad/s, deg/s, mdps or rpm, or --rate-scale and the rad/s per unit";
             units.push(self.known(*index, rate_claim(&self.names[*index]).0, remedy)?);
         }
         match units.first() {
             Some(first) if units.iter().all(|unit| unit == first) => Ok(*first),
             None => Ok(None),
-            Some(_) => {
-                Err(self.refuse("the names of the rates tell different units".to_owned(), "tell the unit of all three"))
-            }
+            Some(_) => Err(self.refuse(
+                "the names of the rates tell different units".to_owned(),
+                "give that of all three (--rate-unit)",
+            )),
         }
     }
 
@@ -502,6 +534,9 @@ mod tests {
             (["t [ms]", "gyro_x[deg/s]", "gyro_y[deg/s]", "gyro_z[deg/s]"], Milliseconds, DegreesPerSecond),
             (["timestamp_ns", "wx_dps", "wy_dps", "wz_dps"], Nanoseconds, DegreesPerSecond),
             (["time_s", "omega_rad_s[0]", "omega_rad_s[1]", "omega_rad_s[2]"], Seconds, RadiansPerSecond),
+            (["Zeit (s)", "P (rad/s)", "Q (rad/s)", "R (rad/s)"], Seconds, RadiansPerSecond),
+            (["time, ms", "ωₓ [deg/s]", "ωᵧ [deg/s]", "ωᶻ [deg/s]"], Milliseconds, DegreesPerSecond),
+            (["t_rel (s)", "rotRateX_dps", "rotRateY_dps", "rotRateZ_dps"], Seconds, DegreesPerSecond),
         ] {
             let places = found(&names, &Options::default()).unwrap();
             assert_eq!((places.time, places.rates), (Some(0), [Some(1), Some(2), Some(3)]), "{names:?}");
@@ -524,6 +559,11 @@ mod tests {
         );
         assert!(refused(&["time", "t", "wx", "wy", "wz"], &none).contains("more than one column"));
         assert!(refused(&["time", "wx_dps", "wy_dps", "wz_rad_s"], &none).contains("different units"));
+        let scaled = ["t_s", "gyro_x_deg_s_100", "gyro_y_deg_s_100", "gyro_z_deg_s_100"];
+        assert!(refused(&scaled, &none).contains("`x deg s 100` is not a known unit"));
+        assert!(refused(&["t_s", "wx rad/s/s", "wy rad/s/s", "wz rad/s/s"], &none).contains("about x"));
+        assert!(refused(&["t_s", "wx (rad/s/s)", "wy (rad/s/s)", "wz (rad/s/s)"], &none).contains("not a known unit"));
+        assert!(refused(&["t_s", "q", "r"], &none).contains("about x"));
         let named = |time: &str, rates: [&str; 3]| Options {
             time: Some(time.to_owned()),
             rates: Some(rates.map(str::to_owned)),

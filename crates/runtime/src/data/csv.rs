@@ -77,7 +77,9 @@ impl Csv {
         let rest = Spaces { source: rest, joins: found.separator == b' ', last: b'\n' };
         let mut builder = ReaderBuilder::new();
         builder.delimiter(found.separator).comment(Some(b'#')).trim(Trim::All).has_headers(false).flexible(true);
-        let comma = found.separator != b',';
+        // Beside a decimal point, a comma groups the digits of a number.
+        let point = found.first.iter().any(|cell| cell.contains('.') && cell.parse::<f64>().is_ok());
+        let comma = found.separator != b',' && !point;
         let lines = Lines {
             path: path.to_owned(),
             reader: builder.from_reader(rest),
@@ -208,7 +210,8 @@ impl Lines {
             Some(value) => Ok(Some(value)),
             None if table::is_unknown(cell) => Ok(None),
             None if table::is_decimal_comma(cell) => {
-                Err(self.no_number(column, name, "has a decimal comma; separate the cells by semicolons or tabs"))
+                let remedy = "has a comma, and others a decimal point or commas between cells; write all with a point and no comma";
+                Err(self.no_number(column, name, remedy))
             }
             None => Err(self.no_number(column, name, "is not a number; correct it, or leave the cell empty")),
         }

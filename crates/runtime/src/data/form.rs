@@ -146,12 +146,12 @@ pub enum DataError {
         expected: usize,
     },
     /// The file does not have a known format.
-    #[error("{}:{line}: {reason}", path.display())]
+    #[error("{}{}: {reason}", path.display(), if *line == 0 { String::new() } else { format!(":{line}") })]
     #[strum(serialize = "not-a-log")]
     Form {
         /// The file.
         path: PathBuf,
-        /// The line, from 1.
+        /// The line, from 1; 0 for the whole file.
         line: u64,
         /// The mistake, and the remedy.
         reason: String,
@@ -180,6 +180,19 @@ pub enum DataError {
         unit: String,
         /// The option that replaces it.
         remedy: &'static str,
+    },
+    /// The stamps do not order the rows.
+    #[error("{}: {count} of the first {rows} rows have {reason}", path.display())]
+    #[strum(serialize = "stamps-out-of-order")]
+    Order {
+        /// The file.
+        path: PathBuf,
+        /// The number of rows that are out of order.
+        count: usize,
+        /// The number of rows.
+        rows: usize,
+        /// The mistake, and the remedy.
+        reason: &'static str,
     },
     /// No free motion is found.
     #[error("{}: no stretch of it is the free motion of one body; cut it with --from and --to, or --segments", path.display())]

@@ -6,7 +6,7 @@ use super::log::{Counts, Entry, Log};
 use super::plausible;
 use crate::identify::{
     AxesFit, Finding, Motion, MotionSummary, RecursiveAxisymmetricIdentifier, RecursiveFit, RecursiveIdentifier,
-    Sample, TensorFit, findings,
+    Sample, TensorFit, findings, has_no_scale,
 };
 use std::path::{Path, PathBuf};
 
@@ -94,8 +94,11 @@ pub fn identify_logs(paths: &[PathBuf], options: &Options, ways: &Ways) -> Resul
     }
     let (axes, body) = (motion.about_known_axes(ways.damping), motion.moments_about_known_axes(ways.damping));
     let tensor = motion.about_unknown_axes(ways.damping);
-    let findings = findings(&motion, axes.as_ref(), body.as_ref(), tensor.as_ref());
+    let mut findings = findings(&motion, axes.as_ref(), body.as_ref(), tensor.as_ref());
     logs.iter().try_for_each(|log| plausible::check_scale(&log.path, &log.meaning, &motion))?;
+    if logs.iter().any(|log| !log.meaning.assumed.is_empty()) && has_no_scale(&motion) {
+        findings.push(Finding::Units);
+    }
     let mut recursive_damping_per_s = 0.0;
     if rereadable {
         recursive_damping_per_s = body.map_or(0.0, |fit| fit.damping_per_s);

@@ -14,6 +14,8 @@ use std::path::{Path, PathBuf};
 
 /// The number of rows read ahead to find the usual interval.
 const HEAD_ROWS: usize = 256;
+/// The least number of intervals by which stamps are judged.
+const FEWEST: usize = 8;
 /// A pause longer than this multiple of the usual interval is a gap, unless `gap_s` is given.
 const GAP_INTERVALS: f64 = 5.0;
 
@@ -162,15 +164,15 @@ impl Log {
             return Err(DataError::Empty { path: path.to_owned() });
         }
         let usual_s = usual_interval_s(&head);
-        let first = head.iter().find_map(|row| row.stamp);
-        let plausible = Plausible::new(path, rows.meaning(), usual_s, first.as_ref())?;
+        check_order(path, &head)?;
+        let plausible = Plausible::new(path, rows.meaning(), usual_s, &head)?;
         let gap_s = options.gap_s.or(usual_s.map(|usual_s| GAP_INTERVALS * usual_s)).unwrap_or(f64::INFINITY);
         Ok(Self {
             path: path.to_owned(),
             rows,
             needed: options.needed,
             gap_s,
-            first,
+            first: head.iter().find_map(|row| row.stamp),
             plausible,
             parts: match &options.cut {
                 Cut::Between(parts) => Some(parts.clone()),
@@ -303,9 +305,31 @@ impl Iterator for Log {
     }
 }
 
+/// Returns the intervals between neighbouring rows, s, with the rows.
+fn intervals(head: &VecDeque<Row>) -> impl Iterator<Item = (f64, &Row, &Row)> {
+    let pairs = head.iter().zip(head.iter().skip(1)).filter(|(last, next)| last.key == next.key);
+    pairs.filter_map(|(last, next)| Some((next.stamp?.since_s(&last.stamp?), last, next)))
+}
+
 /// Returns the median of the intervals above zero, s.
 fn usual_interval_s(head: &VecDeque<Row>) -> Option<f64> {
-    let pairs = head.iter().zip(head.iter().skip(1)).filter(|(last, next)| last.key == next.key);
-    let interval = |(last, next): (&Row, &Row)| Some(next.stamp?.since_s(&last.stamp?));
-    quantile(&sorted(pairs.filter_map(interval).filter(|interval_s| *interval_s > 0.0)), 0.5)
+    quantile(&sorted(intervals(head).map(|(interval_s, ..)| interval_s).filter(|interval_s| *interval_s > 0.0)), 0.5)
+}
+
+/// Refuses stamps of which many fall, or are the same for several samples.
+fn check_order(path: &Path, head: &VecDeque<Row>) -> Result<(), DataError> {
+    let rows = intervals(head).count();
+    let earlier = intervals(head).filter(|(interval_s, ..)| *interval_s < 0.0).count();
+    let moves = |last: &Row, next: &Row| last.rate_rad_s.iter().zip(next.rate_rad_s).any(|(a, b)| (a - b).abs() > 0.0);
+    let equal = intervals(head).filter(|(interval_s, last, next)| *interval_s == 0.0 && moves(last, next)).count();
+    let (count, reason) = if 4 * earlier > rows {
+        (earlier, "an earlier stamp than the row before; sort the rows by time, or name another column of time")
+    } else if 3 * equal > 2 * rows {
+        let reason = "the stamp of the row before, and other rates: the stamps are too coarse; name a finer column of time, or give \
+                      the rows per second (--rate-hz)";
+        (equal, reason)
+    } else {
+        return Ok(());
+    };
+    if rows < FEWEST { Ok(()) } else { Err(DataError::Order { path: path.to_owned(), count, rows, reason }) }
 }

@@ -365,6 +365,30 @@ mod tests {
         assert!(none.to_string().contains("is called `ata`; name an existing one"), "{none}");
     }
 
+    #[test]
+    fn the_unit_of_the_rates_is_honoured_and_options_of_tables_are_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let messages: Vec<_> =
+            (0..9).map(|n| (0, message(true, 1, n * 10_000_000, "imu", [450.0, f64::from(n), 3.0]))).collect();
+        let path = file(directory.path(), &["/imu"], &messages);
+        let refused = Log::open(&path, &Options::default()).unwrap().find_map(Result::err).unwrap().to_string();
+        assert!(refused.contains("--rate-unit deg/s"), "{refused}");
+        let degrees = Options { rate_unit: Some(RateUnit::DegreesPerSecond), ..Options::default() };
+        let first = Log::open(&path, &degrees).unwrap().next().unwrap().unwrap();
+        assert!((first.rate_rad_s[0] - 450.0_f64.to_radians()).abs() < 1e-12);
+        let named = || Some("a".to_owned());
+        for options in [
+            Options { time: named(), ..degrees.clone() },
+            Options { rates: Some(["a", "b", "c"].map(str::to_owned)), ..degrees.clone() },
+            Options { time_unit: Some(TimeUnit::Seconds), ..degrees.clone() },
+            Options { by: named(), ..degrees.clone() },
+            Options { header: false, ..degrees.clone() },
+            Options { skip: 1, ..degrees.clone() },
+        ] {
+            assert!(matches!(Log::open(&path, &options).err(), Some(DataError::Option { .. })), "{options:?}");
+        }
+    }
+
     /// ROS 2 writes unpacked chunks by default, and packs them on request.
     #[test]
     fn chunks_may_be_packed_or_not() {

@@ -14,7 +14,7 @@ const FILE_BYTES: u64 = 16 << 30;
 const CHUNK_BYTES: u64 = 128 << 20;
 
 /// First bytes of files that are not read, what they are, and what converts them.
-const FOREIGN: [(&[u8], &str, &str); 9] = [
+const FOREIGN: [(&[u8], &str, &str); 11] = [
     (b"SQLite format 3", "a ROS 2 bag in SQLite", "convert it: `mcap convert IN.db3 OUT.mcap`"),
     (b"#ROSBAG", "a ROS 1 bag", "convert it: `mcap convert IN.bag OUT.mcap`"),
     (
@@ -28,7 +28,10 @@ const FOREIGN: [(&[u8], &str, &str); 9] = [
     (b"\x89HDF", "HDF5", "write its columns as CSV, such as with `pandas.read_hdf(IN).to_csv(OUT)`"),
     (b"MATLAB 5.0", "a MATLAB file", "write its table as CSV: `writetable(T, OUT)`"),
     (b"\x28\xb5\x2f\xfd", "packed with zstd", "unpack it: `zstd -d IN`"),
+    (b"{\"", "JSON", JSON),
+    (b"[{", "JSON", JSON),
 ];
+const JSON: &str = "write its columns as CSV, such as with `pandas.read_json(IN).to_csv(OUT)`";
 /// The most bytes of those.
 pub const START_BYTES: u64 = 18;
 

@@ -1,9 +1,9 @@
 //! Refuses a log whose assumed units are impossible, and names the likely ones. Must not change a unit.
 
-use super::form::{DataError, Meaning};
-use super::stamp::Stamp;
+use super::form::{DataError, Meaning, Row};
 use super::unit::{RateUnit, TimeUnit};
 use crate::identify::{Motion, wrong_scale};
+use std::collections::VecDeque;
 use std::f64::consts::PI;
 use std::path::Path;
 
@@ -30,18 +30,20 @@ impl Plausible {
     ///
     /// # Errors
     /// [`DataError::Unit`].
-    pub fn new(path: &Path, meaning: &Meaning, usual_s: Option<f64>, first: Option<&Stamp>) -> Result<Self, DataError> {
+    pub fn new(path: &Path, meaning: &Meaning, usual_s: Option<f64>, head: &VecDeque<Row>) -> Result<Self, DataError> {
         let assumed = |what| meaning.assumed.contains(&what);
-        if assumed("time") {
-            if let Some(usual_s) = usual_s.filter(|usual_s| !INTERVALS_S.contains(usual_s)) {
-                let reason = format!("the usual interval would be {usual_s} s");
-                return Err(refuse(path, meaning, reason, likely(meaning, Some(usual_s), None)));
-            }
-            let late = first.filter(|_| meaning.time.1 == TimeUnit::Seconds).map(Stamp::units);
-            if let Some((units, unit)) = late.and_then(|units| Some((units, since_1970(units)?))) {
-                let likely = format!("the stamps are likely in {unit}: give --time-unit {unit}");
-                return Err(refuse(path, meaning, format!("the first stamp would be {units} s"), likely));
-            }
+        if let Some(usual_s) = usual_s.filter(|usual_s| assumed("time") && !INTERVALS_S.contains(usual_s)) {
+            let reason = format!("the usual interval would be {usual_s:.3e} s");
+            let fastest_rad_s = head.iter().map(|row| speed_rad_s(row.rate_rad_s)).reduce(f64::max);
+            let fastest_rad_s = fastest_rad_s.filter(|rate_rad_s| *rate_rad_s < FASTEST_RAD_S);
+            return Err(refuse(path, meaning, reason, likely(meaning, Some(usual_s), fastest_rad_s)));
+        }
+        let first = head.iter().find_map(|row| row.stamp).filter(|_| meaning.time.1 == TimeUnit::Seconds);
+        if let Some((units, unit)) =
+            first.filter(|_| assumed("time")).and_then(|first| Some((first.units(), since_1970(first.units())?)))
+        {
+            let likely = format!("the stamps are likely in {unit}: give --time-unit {unit}");
+            return Err(refuse(path, meaning, format!("the first stamp would be {units} s"), likely));
         }
         let by_turn = usual_s.filter(|_| !meaning.assumed.is_empty()).map_or(f64::INFINITY, |usual_s| PI / usual_s);
         let by_rate = if assumed("rate") { FASTEST_RAD_S } else { f64::INFINITY };
@@ -53,17 +55,21 @@ impl Plausible {
     /// # Errors
     /// [`DataError::Unit`].
     pub fn check(&self, path: &Path, meaning: &Meaning, row: u64, rates_rad_s: [f64; 3]) -> Result<(), DataError> {
-        let square: f64 = rates_rad_s.iter().filter(|rate| rate.is_finite()).map(|rate| rate * rate).sum();
-        if square <= self.fastest_rad_s * self.fastest_rad_s {
+        let rate_rad_s = speed_rad_s(rates_rad_s);
+        if rate_rad_s <= self.fastest_rad_s {
             return Ok(());
         }
-        let rate_rad_s = square.sqrt();
         let turn = self
             .usual_s
             .map_or(String::new(), |usual_s| format!(", and turn by {:.1} rad between samples", rate_rad_s * usual_s));
         let reason = format!("row {row}: the body would turn at {rate_rad_s:.1} rad/s{turn}");
         Err(refuse(path, meaning, reason, likely(meaning, self.usual_s, Some(rate_rad_s))))
     }
+}
+
+/// Returns the angular speed without the unknown rates, rad/s.
+fn speed_rad_s(rates_rad_s: [f64; 3]) -> f64 {
+    rates_rad_s.iter().filter(|rate| rate.is_finite()).map(|rate| rate * rate).sum::<f64>().sqrt()
 }
 
 /// Returns the unit of a stamp that would be thousands of years after 1970 in s: about 1.8e9 s have passed.
@@ -97,9 +103,9 @@ fn scaled(path: &Path, meaning: &Meaning, factor: f64) -> DataError {
         found.push(format!("the rates are likely in {unit}: give --rate-unit {unit}"));
     }
     if found.is_empty() {
-        found.push("say what they are in with --time-unit and --rate-unit".to_owned());
+        found.push("give the units with --time-unit and --rate-unit, or with --rate-scale".to_owned());
     }
-    let reason = format!("Euler's equations hold only for rates that are {factor:.3e} times as large");
+    let reason = format!("Euler's equations hold only for rates, or times, that are {factor:.3e} times as large");
     refuse(path, meaning, reason, found.join("; or "))
 }
 
@@ -129,10 +135,16 @@ fn likely(meaning: &Meaning, usual_s: Option<f64>, rate_rad_s: Option<f64>) -> S
         // Beside a unit of time only the most usual one.
         let units = if found.is_empty() { &RateUnit::NUMBERS[1..] } else { &RateUnit::NUMBERS[1..2] };
         let unit = units.iter().find(|unit| fits(1.0, unit.rad_s() / own));
-        found.extend(unit.map(|unit| format!("the rates are likely in {unit}: give --rate-unit {unit}")));
+        // Beyond deg/s the numbers do not tell them apart.
+        let rest = if unit == Some(&RateUnit::DegreesPerSecond) {
+            ""
+        } else {
+            ", mrad/s, or --rate-scale for a sensor's counts"
+        };
+        found.extend(unit.map(|unit| format!("the rates are likely in {unit}: give --rate-unit {unit}{rest}")));
     }
     if found.is_empty() {
-        found.push("say what they are in with --time-unit and --rate-unit, or with --rate-scale".to_owned());
+        found.push("give the units with --time-unit and --rate-unit, or with --rate-scale".to_owned());
     }
     found.join("; or ")
 }

@@ -48,6 +48,9 @@ impl Stamp {
         let (date, clock) = text.rsplit_once(['T', ' ']).unwrap_or(("", text));
         // The offset from UTC is the same at every row.
         let clock = clock.split(['Z', '+', '-']).next()?;
+        // Minutes and seconds alone have a fraction, to differ from hours and minutes.
+        let minutes = clock.split_once(':').filter(|(_, second)| second.contains('.') && !second.contains(':'));
+        let clock = if minutes.is_some() { format!("0:{clock}") } else { clock.to_owned() };
         let mut parts = clock.split(':');
         let (hour, minute, second) = (parts.next()?.parse::<u32>().ok()?, parts.next()?, parts.next()?);
         let hour = afternoon.map_or(hour, |half| hour % 12 + half);
@@ -107,6 +110,7 @@ mod tests {
             ("28.11.2026 12:00:00", "28.11.2026 12:00:01", 1.0),
             ("11:59:59 AM", "12:00:01 PM", 2.0),
             ("12:00:00:100", "12:00:00:350", 0.25),
+            ("59:59.75", "1:00:00", 0.25),
         ] {
             assert!((since_s(from, to) - expected_s).abs() < 1e-12, "{from} {to}: {}", since_s(from, to));
         }

@@ -130,7 +130,7 @@ fn plain_separator(line: &str) -> u8 {
 /// Returns the lines before the first row that may be its header: first those with as many cells.
 fn headers(before: &[Line<'_>], separator: u8, count: usize) -> Vec<(u64, Vec<String>)> {
     let mut found = Vec::new();
-    let named = |line: &Line<'_>| {
+    let split = |line: &Line<'_>, separator: u8| {
         let text = line.comment().unwrap_or(line.text);
         let mut names = cells(text, separator);
         // A separator at the end of the line.
@@ -139,6 +139,7 @@ fn headers(before: &[Line<'_>], separator: u8, count: usize) -> Vec<(u64, Vec<St
         }
         names
     };
+    let named = |line: &Line<'_>| split(line, separator);
     for (index, line) in before.iter().enumerate().rev().filter(|(_, line)| named(line).len() == count) {
         let names = named(line);
         found.push((line.number, names.clone()));
@@ -157,6 +158,18 @@ fn headers(before: &[Line<'_>], separator: u8, count: usize) -> Vec<(u64, Vec<St
             found.push((before[index - 1].number, pairs.collect()));
         }
     }
+    // A header may be separated in another way than the rows, such as by two spaces.
+    let otherwise = before.iter().rev().filter(|line| named(line).len() != count).filter_map(|line| {
+        let text = line.comment().unwrap_or(line.text);
+        let apart = text.split("  ").map(|name| name.trim().to_owned()).filter(|name| !name.is_empty()).collect();
+        let names = SEPARATORS
+            .iter()
+            .map(|separator| split(line, *separator))
+            .chain([apart])
+            .find(|names: &Vec<String>| names.len() == count)?;
+        Some((line.number, names))
+    });
+    found.extend(otherwise);
     let shorter = before.iter().rev().filter(|line| line.comment().is_none() && named(line).len() != count);
     found.extend(shorter.map(|line| (line.number, named(line))));
     found
@@ -201,5 +214,10 @@ mod tests {
         let units = find("t,wx,wy,wz\ns,dps,dps,dps\n0,1,2,3\n1,1,2,3\n").unwrap();
         assert!(units.headers.contains(&(1, ["t s", "wx dps", "wy dps", "wz dps"].map(str::to_owned).to_vec())));
         assert_eq!(found("0,1,2,3\n1,1,2,3\n").3, [""; 0]);
+        for header in ["t wx wy wz", "t;wx;wy;wz", "# t\twx\twy\twz"] {
+            assert_eq!(found(&format!("{header}\n0,1,2,3\n1,1,2,3\n")).3, ["t", "wx", "wy", "wz"]);
+        }
+        let apart = found("#t (s)   wx (rad/s)   wy (rad/s)   wz (rad/s)\n0  1  2  3\n1  1  2  3\n");
+        assert_eq!(apart.3, ["t (s)", "wx (rad/s)", "wy (rad/s)", "wz (rad/s)"]);
     }
 }

@@ -98,7 +98,8 @@ fn an_invalid_log_is_refused_with_place_reason_and_remedy() {
         ("t_s,wx,wy,wz\n0,1e999,2,3\n", "`1e999` is not finite"),
         ("t_s,wx,wy,wz\n1e300,1,2,3\n", "out of the range of time stamps"),
         ("t_s,wx,wy,wz\n12:30:01,1,2,3\n12:30,1,2,3\n", "column t_s: `12:30` is not a time of day"),
-        ("t,wx,wy,wz\n0,1,2,3\n10020000,1,2,3\n20040000,1,2,3\n", "give --time-unit us"),
+        ("t,wx,wy,wz\n0,1,2,3\n10020000,1,2,3\n20040000,1,2,3\n", "give --time-unit ns"),
+        ("t_ms;wx;wy;wz\n12,345;1.5;2.5;3\n12,355;1.5;2.5;3\n", "`12,345` has a comma, and others a decimal point"),
         ("\0\0", "the file is not text"),
         ("0,1,2,3\n1,1,2,3\n", "if it has no header say so"),
     ] {
@@ -109,6 +110,26 @@ fn an_invalid_log_is_refused_with_place_reason_and_remedy() {
     assert!(refusal("t_s,wx,wy,wz\n0,1,2,3\n", &gap).contains("give a number above 0"));
     let missing = Log::open("no/such/file".as_ref(), &none).err().unwrap().to_string();
     assert!(missing.contains("cannot read no/such/file"), "{missing}");
+}
+
+#[test]
+fn stamps_must_order_the_rows() {
+    let text = |stamp: fn(u32) -> u32| {
+        (0..30).fold("t_ms,wx,wy,wz\n".to_owned(), |text, row| text + &format!("{},{row},2,3\n", stamp(row)))
+    };
+    let none = Options::default();
+    for (stamp, words) in [
+        ((|row| 900 - 10 * row) as fn(u32) -> u32, "29 of the first 29 rows have an earlier stamp"),
+        (|row| 10 * (row ^ 1), "have an earlier stamp"),
+        (|_| 7, "the stamps are too coarse"),
+        (|row| row / 10, "the stamps are too coarse"),
+    ] {
+        let refused = refusal(&text(stamp), &none);
+        assert!(refused.contains(words), "{refused}");
+    }
+    // Two rows of each stamp, and a second run.
+    assert_eq!(entries(&text(|row| 10 * (row / 2)), &none).1.repeated, 15);
+    assert_eq!(entries(&text(|row| 10 * (row % 15)), &none).1.segments, 2);
 }
 
 #[test]

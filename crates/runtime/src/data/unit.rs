@@ -41,9 +41,9 @@ impl TimeUnit {
             "ms" | "msec" | "msecs" | "millis" | "millisec" | "millisecond" | "milliseconds" | "мс" => {
                 Self::Milliseconds
             }
-            "us" | "µs" | "μs" | "usec" | "usecs" | "micros" | "microsec" | "microsecond" | "microseconds" | "мкс" => {
-                Self::Microseconds
-            }
+            // The last ones are UTF-8 and the code page 437, read as Latin-1.
+            "us" | "µs" | "μs" | "usec" | "usecs" | "micros" | "microsec" | "microsecond" | "microseconds" | "мкс"
+            | "âµs" | "î¼s" | "æs" => Self::Microseconds,
             "ns" | "nsec" | "nsecs" | "nanos" | "nanosec" | "nanosecs" | "nanosecond" | "nanoseconds" | "нс" => {
                 Self::Nanoseconds
             }
@@ -109,47 +109,74 @@ impl RateUnit {
         }
     }
 
-    /// Parses a unit: `rad/s`, `deg/s`, `dps`, `mdps`, `mrad/s`, `rpm`, `rev/s`, and their longer spellings. A unit of angle alone
-    /// means per second.
+    /// Parses a unit: an angle per time, such as `rad/s`, `dps`, `deg/h`, `mdps`, `µrad/s`, `rpm` or `rev/s`, and longer spellings. An
+    /// angle alone means per second. A unit without name is a scale.
     pub fn parse(name: &str) -> Option<Self> {
         let lower = name.to_lowercase().replace('¹', "1");
         let text: String = lower.chars().filter_map(degree).filter(|c| c.is_alphanumeric() || *c == '°').collect();
-        let per_second = |rest: &str| {
-            ["s", "ps", "pers", "sec", "persec", "second", "persecond", "s1", "sec1", "с", "сек"].contains(&rest)
-        };
-        let angle = |text: &str| {
-            let after = |words: &[&str]| words.iter().find_map(|word| text.strip_prefix(word).map(str::to_owned));
-            match (after(&["radians", "radian", "rad", "рад"]), after(&["degrees", "degree", "deg", "град", "°"]))
-            {
-                (Some(rest), _) if rest.is_empty() || per_second(&rest) => Some(Self::RadiansPerSecond),
-                (_, Some(rest)) if rest.is_empty() || per_second(&rest) => Some(Self::DegreesPerSecond),
-                _ => (text == "dps").then_some(Self::DegreesPerSecond),
-            }
-        };
-        let milli = || match angle(text.strip_prefix("milli").or_else(|| text.strip_prefix('m'))?)? {
-            Self::RadiansPerSecond => Some(Self::MilliradiansPerSecond),
-            _ => Some(Self::MillidegreesPerSecond),
-        };
-        let turns = || {
-            let words = ["revolutions", "revolution", "revs", "rev", "turns", "turn", "rotations"];
-            words.iter().filter_map(|word| text.strip_prefix(word)).find_map(|rest| {
-                let per_minute = ["min", "permin", "minute", "perminute", "min1"].contains(&rest);
-                let unit = if per_minute { Self::RevolutionsPerMinute } else { Self::RevolutionsPerSecond };
-                (per_minute || per_second(rest)).then_some(unit)
-            })
-        };
-        let rpm = || (text == "rpm").then_some(Self::RevolutionsPerMinute);
-        angle(&text).or_else(milli).or_else(turns).or_else(rpm)
+        let mut prefixes = PREFIXES.iter();
+        let rad_s = prefixes.find_map(|(prefix, part)| Some(part * angle_per_second(text.strip_prefix(prefix)?)?))?;
+        let same = |unit: &&Self| (unit.rad_s() / rad_s - 1.0).abs() < 1e-12;
+        Some(Self::NUMBERS.iter().find(same).copied().unwrap_or(Self::Scale(rad_s)))
     }
+}
+
+/// Parts of a unit, as words and their size.
+const PREFIXES: [(&str, f64); 13] = [
+    ("", 1.0),
+    ("milli", 1e-3),
+    ("m", 1e-3),
+    ("micro", 1e-6),
+    ("µ", 1e-6),
+    ("μ", 1e-6),
+    ("u", 1e-6),
+    ("nano", 1e-9),
+    ("n", 1e-9),
+    ("centi", 1e-2),
+    ("c", 1e-2),
+    ("deci", 1e-1),
+    ("d", 1e-1),
+];
+/// In rad; those of the first two rows may stand alone.
+const ANGLES: [(&str, f64); 5] = {
+    use std::f64::consts::{PI, TAU};
+    [
+        ("rad radian radians рад", 1.0),
+        ("deg degree degrees град °", PI / 180.0),
+        ("arcsec arcsecond arcseconds", PI / 648e3),
+        ("arcmin arcminute arcminutes", PI / 10.8e3),
+        ("rev revs revolution revolutions turn turns rot rotations", TAU),
+    ]
+};
+/// In 1/s.
+const PER_TIME: [(&str, f64); 3] = [
+    ("s ps pers sec persec second persecond s1 sec1 с сек", 1.0),
+    ("min permin minute perminute min1", 1.0 / 60.0),
+    ("h hr perh perhr hour perhour h1", 1.0 / 3600.0),
+];
+/// Shorter names of an angle per time, in rad/s.
+const SHORT: [(&str, f64); 3] = {
+    use std::f64::consts::{PI, TAU};
+    [("dps", PI / 180.0), ("dph", PI / 648e3), ("rpm rmin umin trmin", TAU / 60.0)]
+};
+
+/// Returns an angle per time in rad/s.
+fn angle_per_second(text: &str) -> Option<f64> {
+    let named = |list: &[(&str, f64)], text: &str| {
+        list.iter().find(|(words, _)| words.split(' ').any(|word| word == text)).map(|(_, size)| *size)
+    };
+    let mut angles = ANGLES.iter().flat_map(|(words, rad)| words.split(' ').map(move |word| (word, *rad)));
+    let parts = angles.find_map(|(word, rad)| Some(rad * named(&PER_TIME, text.strip_prefix(word)?)?));
+    parts.or_else(|| named(&ANGLES[..2], text)).or_else(|| named(&SHORT, text))
 }
 
 /// Replaces the signs that stand for a degree in other encodings.
 fn degree(letter: char) -> Option<char> {
     match letter {
-        // Ordinal indicator, ring above, ring operator, and Mac OS Roman and DOS read as Latin-1.
-        'º' | '˚' | '∘' | '¡' | 'ø' => Some('°'),
-        // UTF-8 read as Latin-1 has this letter before the sign.
-        'â' => None,
+        // Ordinal indicator, ring above, ring operator, superscript zero, and Mac OS Roman and DOS read as Latin-1.
+        'º' | '˚' | '∘' | '⁰' | '¡' | 'ø' => Some('°'),
+        // UTF-8 read as Latin-1 has this letter before the sign; GBK and EUC have these after it.
+        'â' | 'ã' | 'ë' => None,
         letter => Some(letter),
     }
 }
@@ -163,7 +190,11 @@ impl fmt::Display for RateUnit {
             Self::MillidegreesPerSecond => "mdps",
             Self::RevolutionsPerMinute => "rpm",
             Self::RevolutionsPerSecond => "rev/s",
-            Self::Scale(rad_s) => return write!(f, "{rad_s} rad/s"),
+            // Seven digits, without zeros behind them.
+            Self::Scale(rad_s) => {
+                let digits = format!("{rad_s:.6e}");
+                return write!(f, "units of {} rad/s", digits.parse::<f64>().unwrap_or(*rad_s));
+            }
         })
     }
 }
@@ -186,18 +217,47 @@ mod tests {
             ),
             (MillidegreesPerSecond, &["mdps", "mdeg/s", "m°/s", "millidegrees per second"]),
             (MilliradiansPerSecond, &["mrad/s", "mrad", "millirad/s"]),
-            (RevolutionsPerMinute, &["rpm", "rev/min", "turns per minute"]),
+            (RevolutionsPerMinute, &["rpm", "rev/min", "turns per minute", "r/min", "U/min", "tr/min"]),
+            (DegreesPerSecond, &["¡ã/s", "⁰/s", "degs"]),
             (RevolutionsPerSecond, &["rev/s", "turns/s"]),
         ] {
             spellings.iter().for_each(|text| assert_eq!(RateUnit::parse(text), Some(unit), "{text}"));
         }
-        for text in
-            ["", "/s", "\u{fffd}/s", "?/s", "rps", "deg/h", "rad/s^2", "rad/s2", "Hz", "turn", "rev", "cdps", "Grad/s"]
-        {
+        for text in [
+            "",
+            "/s",
+            "\u{fffd}/s",
+            "?/s",
+            "rps",
+            "rad/s^2",
+            "rad/s2",
+            "rad/s/s",
+            "deg/ms",
+            "Hz",
+            "turn",
+            "rev",
+            "Grad/s",
+            "arcsec",
+            "min",
+        ] {
             assert_eq!(RateUnit::parse(text), None, "{text}");
         }
+        for (text, rad_s) in [
+            ("deg/h", 1.0_f64.to_radians() / 3600.0),
+            ("°/hr", 1.0_f64.to_radians() / 3600.0),
+            ("degrees per minute", 1.0_f64.to_radians() / 60.0),
+            ("µrad/s", 1e-6),
+            ("urad/s", 1e-6),
+            ("nrad/s", 1e-9),
+            ("cdps", 1.0_f64.to_radians() / 100.0),
+            ("arcsec/s", 1.0_f64.to_radians() / 3600.0),
+            ("rad/min", 1.0 / 60.0),
+        ] {
+            let found = RateUnit::parse(text).map_or(f64::NAN, RateUnit::rad_s);
+            assert!((found / rad_s - 1.0).abs() < 1e-12, "{text}: {found}");
+        }
         for (text, unit) in
-            [("µs", TimeUnit::Microseconds), ("μs", TimeUnit::Microseconds), ("MS", TimeUnit::Milliseconds)]
+            [("µs", TimeUnit::Microseconds), ("Âµs", TimeUnit::Microseconds), ("MS", TimeUnit::Milliseconds)]
         {
             assert_eq!(TimeUnit::parse(text), Some(unit), "{text}");
         }
