@@ -47,7 +47,7 @@ const ELSEWHERE: [(&str, &str); 34] = [
     ("tests/", "a campaign of its own; its short form is in the tests"),
     ("fuzz/run", "a campaign of its own; tests/run checks the targets"),
     ("COROTATE_", "a campaign of its own; its short form is in the tests"),
-    ("packaging/", "it needs Docker or cargo-deb"),
+    ("packaging/", "it compiles for many minutes, or needs its packages; CONTRIBUTING.md"),
 ];
 /// Commands that need a run.
 const DURING_A_RUN: [&str; 9] = [
@@ -248,6 +248,7 @@ pages! {
     formats: "docs/formats.md",
     foxglove: "docs/foxglove.md",
     own_data: "docs/own-data.md",
+    packages: "docs/packages.md",
     papers: "docs/papers.md",
     python: "docs/python.md",
     real_time: "docs/real-time.md",

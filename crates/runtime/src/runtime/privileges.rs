@@ -274,11 +274,11 @@ pub fn request_short_slices() {
     }
 }
 
+/// Calls the kernel: the function of the C library musl only fails.
 #[allow(unsafe_code)]
-fn set_scheduler(policy: i32, priority: i32) -> io::Result<()> {
-    let parameters = libc::sched_param { sched_priority: priority };
-    // SAFETY: pid 0 is the calling thread, and the pointer is to a live, fully initialised sched_param.
-    match unsafe { libc::sched_setscheduler(0, policy, &raw const parameters) } {
+fn set_scheduler(policy: libc::c_int, priority: libc::c_int) -> io::Result<()> {
+    // SAFETY: thread 0 is the calling one, and the pointer is to a live integer, which is all that the kernel's sched_param has.
+    match unsafe { libc::syscall(libc::SYS_sched_setscheduler, 0, policy, &raw const priority) } {
         0 => Ok(()),
         _ => Err(io::Error::last_os_error()),
     }
