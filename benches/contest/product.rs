@@ -87,7 +87,7 @@ impl<R: Rig> Ours<R> {
     ) {
         self.observer.step(observed, estimate);
         if let Some(controller) = &mut self.controller {
-            controller.step(estimate, own, command);
+            controller.step(estimate, None, own, command);
         }
     }
 

@@ -283,7 +283,7 @@ fn ekf_step(
     estimate.stamp = observed.stamp;
     estimate.omega_rad_s = filter.state.into();
     (estimate.valid, estimate.status) = (7, 0);
-    controller.step(estimate, own, command);
+    controller.step(estimate, None, own, command);
 }
 
 /// Returns a copy of the samples in and out: the floor of every step.

@@ -39,7 +39,7 @@ fn run_loop(scenario: &Scenario, pieces: &[(u8, &[u8])]) {
         node.start(Grid { epoch_ns: 0, period_ns: scenario.period_ns }, 0).unwrap();
         node
     };
-    let mut nodes = [role(RoleId::Observer), role(RoleId::Controller), role(RoleId::Plant(1))];
+    let mut nodes = [role(RoleId::Observer(0)), role(RoleId::Controller), role(RoleId::Plant(1))];
     let mut measurement = bus.writer::<RateMeasurement>(&topic_of("leader", Signal::Measurement), 1).unwrap();
     let mut estimate = bus.writer::<RateEstimate>(&topic_of("leader", Signal::Estimate), 1).unwrap();
     let mut command = bus.writer::<RateCommand>(&topic_of("follower", Signal::Command), 1).unwrap();

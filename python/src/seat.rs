@@ -22,7 +22,7 @@ const LEFT: &str = "this role is not computed any more";
 #[pyfunction]
 pub fn seat(given: &str, kind: &str, role: &str) -> PyResult<String> {
     let scenario = scenario(given, kind, &["clock=lockstep".to_owned()])?;
-    let known = scenario.rig.roles().join(", ");
+    let known = scenario.roles().join(", ");
     let id = RoleId::named(&scenario, role)
         .ok_or_else(|| failed(format!("there is no role `{role}`; known here: {known}")))?;
     Ok(describe_seat(&scenario, id, None).to_json())

@@ -31,7 +31,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         board.remark("chain is not measured: no body of this scenario is driven, so there is no command".to_owned());
         return Ok(());
     }
-    let all = format!("[{:?}]", scenario.rig.roles());
+    let all = format!("[{:?}]", scenario.roles());
     let domain = OwnedDomain::create(0)?;
     let mut raw = RawChain::open(board, &domain)?;
     for round in 1..=rounds {
@@ -122,7 +122,7 @@ impl RawChain {
         self.relay.receive(grid, self.number + 1, count, true)?;
         self.last.receive(grid, self.number + 1, count, false)?;
         bench.in_the_leaders_place(board, |place| {
-            let co_located = place.co_located.contains(&RoleId::Observer);
+            let co_located = place.co_located.contains(&RoleId::Observer(0));
             send_paced(&mut self.sender, grid, count, &mut self.number, co_located)
         })?;
         let (_, lost_first) = self.relay.received()?;

@@ -60,8 +60,8 @@ enum Answer {
 pub fn serve_peer(domain: &Path, scenario: &Scenario, observer: bool) -> Result<(), String> {
     let domain = Domain::join(domain).map_err(|error| error.to_string())?;
     let (role, waits_for) = match observer {
-        true => (RoleId::Observer, RoleId::Plant(0)),
-        false => (RoleId::Controller, RoleId::Observer),
+        true => (RoleId::Observer(0), RoleId::Plant(0)),
+        false => (RoleId::Controller, RoleId::Observer(0)),
     };
     let Privileges { grants, co_located, .. } = take_privileges(scenario, role);
     send_answer(&Answer::Here(grants))?;

@@ -227,7 +227,7 @@ fn argument<'a>(words: &'a [String], name: &str) -> Option<&'a str> {
 
 /// Returns the roles that a launcher has started.
 fn roles(scenario: &Scenario, launcher: i32) -> Vec<Process> {
-    let names = scenario.rig.roles();
+    let names = scenario.roles();
     let role = |(pid, words): (i32, Vec<String>)| {
         let kind = words.get(1)?.clone();
         let name = argument(&words, "--body").map_or(kind, str::to_owned);

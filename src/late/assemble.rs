@@ -271,7 +271,7 @@ mod tests {
 
     #[test]
     fn a_late_input_leads_to_the_sender_and_its_cause() {
-        let (leader, observer) = (RoleId::Plant(0).number(), RoleId::Observer.number());
+        let (leader, observer) = (RoleId::Plant(0).number(), RoleId::Observer(0).number());
         let report = of_roles([
             ("leader", vec![record(5, 800, 0, 0)]),
             ("observer", vec![record(5, 803, leader, 801)]),
@@ -298,7 +298,7 @@ mod tests {
 
     #[test]
     fn a_starved_body_leads_to_the_tick_of_its_command() {
-        let missed = LateRecord { missed: 3, ..record(4, 3200, RoleId::Observer.number(), 0) };
+        let missed = LateRecord { missed: 3, ..record(4, 3200, RoleId::Observer(0).number(), 0) };
         let starved = LateRecord { starved: true, sender: RoleId::Controller.number(), ..record(6, 0, 0, 0) };
         let report = of_roles([("leader", vec![]), ("controller", vec![missed]), ("follower", vec![starved])]);
         let late = report.find("follower", 6).unwrap();
@@ -309,7 +309,7 @@ mod tests {
 
     #[test]
     fn senders_that_blame_each_other_end_the_search() {
-        let (leader, observer) = (RoleId::Plant(0).number(), RoleId::Observer.number());
+        let (leader, observer) = (RoleId::Plant(0).number(), RoleId::Observer(0).number());
         let report = of_roles([
             ("leader", vec![record(5, 800, observer, 790)]),
             ("observer", vec![record(5, 800, leader, 790)]),

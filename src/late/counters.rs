@@ -137,13 +137,13 @@ mod tests {
             usage,
             ..LateRecord::default()
         };
-        let of_observer = |usage| of_role(RoleId::Observer, record(usage));
+        let of_observer = |usage| of_role(RoleId::Observer(0), record(usage));
         assert_eq!(of_observer(Usage::default()), [(CauseKind::Step, 397.0)]);
         let minor_faults = 200;
         assert_eq!(of_observer(Usage { minor_faults, ..Usage::default() }), [(CauseKind::PageFault, 397.0)]);
         let few = Usage { minor_faults: 20, ..Usage::default() };
         assert_eq!(of_observer(few), [(CauseKind::Step, 397.0)], "20 faults take 80 us");
         let starved = LateRecord { starved: true, ..record(Usage::default()) };
-        assert_eq!(of_role(RoleId::Observer, starved), []);
+        assert_eq!(of_role(RoleId::Observer(0), starved), []);
     }
 }

@@ -55,8 +55,8 @@ impl RoleProcess {
         let name = role.name(scenario).to_owned();
         let mut command = program(&name)?;
         command.arg(role.kind()).arg("--domain").arg(domain.root());
-        if let RoleId::Plant(_) = role {
-            command.arg("--body").arg(&name);
+        if let RoleId::Plant(index) | RoleId::Observer(index @ 1..) = role {
+            command.arg("--body").arg(&*scenario.bodies[index].name);
         }
         let panic = panic_path(domain.root(), &name);
         let mut process = Self::spawn(command, name)?;

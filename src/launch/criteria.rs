@@ -6,6 +6,7 @@ use super::outcome::{Accounting, StageFigures, links_of};
 use super::{Action, Outcome};
 use crate::config::{ClockKind, TickAmount, TickLimit};
 use crate::fault::{Action as FaultAction, Interruption};
+use crate::runtime::RoleId;
 use crate::scenario::Scenario;
 use crate::score::StepResponse;
 use crate::telemetry::{PaceReport, Percentiles, Ticks};
@@ -205,7 +206,10 @@ impl Judge<'_> {
     /// Judges the role with the largest latency.
     fn latency(&self, key: &str, limit: f64) -> Criterion {
         let (_, stage, figure) = LATENCIES[LATENCIES.iter().position(|(name, ..)| *name == key).unwrap_or(0)];
-        let acts = |role: &str| stage == "lateness" || ["observer", "controller"].contains(&role);
+        let acts = |role: &str| {
+            let plant = matches!(RoleId::named(self.scenario, role), Some(RoleId::Plant(_)));
+            stage == "lateness" || !plant
+        };
         let judged = self.latencies.iter().filter(|row| row.stage == stage && acts(&row.role));
         let figures = judged.map(|row| (&row.role, figure(&row.figures)));
         // NaN is above every number: a stage without a figure was not measured, and then the largest is not known.

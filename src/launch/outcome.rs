@@ -324,8 +324,12 @@ pub(super) fn latencies(scenario: &Scenario, reports: &[RoleReport]) -> Vec<Stag
     let figures = |report: &RoleReport, stage: &crate::telemetry::StageReport| {
         let (latency, role, stage) = (stage.latency(), report.role.clone(), stage.stage.clone());
         let figures = latency.percentiles();
-        // An age begins at the leader, a hop at the sender of the input; other stages use one clock.
-        let sender = if stage == "hop" && role == "controller" { RoleId::Observer } else { RoleId::Plant(0) };
+        // An age begins at the first body or at that of an observer, a hop at the sender of the input; other stages use one clock.
+        let sender = match RoleId::named(scenario, &role) {
+            Some(RoleId::Controller) if stage == "hop" => RoleId::Observer(0),
+            Some(RoleId::Observer(index)) => RoleId::Plant(index),
+            _ => RoleId::Plant(0),
+        };
         let stamps_of = (!figures.are_shown()).then(|| sender.name(scenario).to_owned());
         StageFigures { role, stage, stamps_of, figures, latency }
     };

@@ -290,7 +290,8 @@ impl Steps {
         self.truths.iter().map(|truth| &truth.state)
     }
 
-    /// Returns the controller's samples of the current tick: the estimate, then each driven body's measurement, as words with stamps.
+    /// Returns the controller's samples of the current tick: the first body's estimate, each driven body's measurement, then the own
+    /// estimates of driven bodies, as words with stamps.
     pub fn inputs(&self) -> &[Option<Vec<u64>>] {
         &self.inputs
     }

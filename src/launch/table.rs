@@ -243,13 +243,14 @@ fn verdict(holds: Option<bool>) -> String {
 
 /// The latencies of estimate and control, and the role with the largest p99 of its lateness, as a table.
 fn critical_latencies(summary: &Summary) -> Table {
-    let find = |role: &str, stage: &str| summary.latencies.iter().find(|row| row.role == role && row.stage == stage);
+    let of_stage = |stage: &'static str| summary.latencies.iter().filter(move |row| row.stage == stage);
+    let observes = |role: &str| role == "observer" || role.starts_with("observer-");
+    let steps = of_stage("step").filter(|row| observes(&row.role) || row.role == "controller");
+    let ages = of_stage("age").filter(|row| row.role == "controller");
     let lateness = summary.latencies.iter().filter(|row| row.stage == "lateness");
     let latest = lateness.max_by(|a, b| a.figures.p99_us.max(0.0).total_cmp(&b.figures.p99_us.max(0.0)));
-    let stages =
-        [("observer", "step"), ("controller", "step"), ("controller", "age")].map(|(role, stage)| find(role, stage));
     let mut rows = plain(&["latency, us", "p50", "p99", "p99.9", "max"]);
-    for row in stages.into_iter().chain([latest]).flatten() {
+    for row in steps.chain(ages).chain(latest) {
         let figures = [row.figures.p50_us, row.figures.p99_us, row.figures.p999_us, row.figures.max_us];
         rows.add_row([format!("{} {}", row.role, row.stage)].into_iter().chain(figures.map(us)));
     }

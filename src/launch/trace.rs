@@ -159,7 +159,7 @@ impl Traced {
     fn needed(&self, next_tick: impl Fn(RoleId) -> Option<u64>, scored: Option<u64>) -> Option<u64> {
         let needed_by = |role: &RoleId| match role {
             RoleId::Plant(_) => next_tick(*role)?.checked_sub(1),
-            RoleId::Observer | RoleId::Controller => next_tick(*role),
+            RoleId::Observer(_) | RoleId::Controller => next_tick(*role),
         };
         let scored = scored.filter(|_| self.signal != Signal::Measurement);
         self.readers.iter().filter_map(needed_by).chain(scored).min()

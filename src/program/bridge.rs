@@ -136,9 +136,11 @@ pub fn bridge(arguments: &Arguments) -> CommandResult {
 
 fn exit_of(error: &RoleError) -> Exit {
     match error {
-        RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::NoDevice { .. } => {
-            Exit::Usage
-        }
+        RoleError::Domain(_)
+        | RoleError::Config(_)
+        | RoleError::NoSuchRole { .. }
+        | RoleError::NoDevice { .. }
+        | RoleError::DeviceReadsOwn { .. } => Exit::Usage,
         // A silent device is a failure; a wrong device is a usage error.
         RoleError::Device(DeviceError::Silent { .. }) => Exit::Failure,
         RoleError::Device(_) => Exit::Usage,

@@ -90,8 +90,8 @@ enum Command {
     Seat(seat::Arguments),
     /// Run one body of a run (normally started by the launcher)
     Plant(role::PlantArguments),
-    /// Run the observer of a run (normally started by the launcher)
-    Observer(role::Arguments),
+    /// Run an observer of a run (normally started by the launcher)
+    Observer(role::ObserverArguments),
     /// Run the controller of a run (normally started by the launcher)
     Controller(role::Arguments),
     /// Connect a device on a serial line to a run, as a role
@@ -281,7 +281,7 @@ fn execute(command: Option<Command>) -> Exit {
         Some(Command::New(arguments)) => new::new(&arguments),
         Some(Command::Seat(arguments)) => seat::seat(&arguments),
         Some(Command::Plant(arguments)) => role::role(&arguments.body, &arguments.role),
-        Some(Command::Observer(arguments)) => role::role("observer", &arguments),
+        Some(Command::Observer(arguments)) => role::observer(&arguments),
         Some(Command::Controller(arguments)) => role::role("controller", &arguments),
         Some(Command::Bridge(arguments)) => bridge::bridge(&arguments),
         Some(Command::Record(arguments)) => record::record(&arguments),

@@ -92,7 +92,7 @@ fn roles(name: &str, scenario: &Scenario) -> Result<Vec<RoleId>, RecordError> {
         return Ok(RoleId::all(scenario));
     }
     RoleId::named(scenario, name).map(|role| vec![role]).ok_or_else(|| {
-        let known = scenario.rig.roles().join(", ");
+        let known = scenario.roles().join(", ");
         RecordError::UnknownRole { role: name.to_owned(), known }
     })
 }

@@ -37,6 +37,23 @@ pub struct PlantArguments {
     pub role: Arguments,
 }
 
+/// Options of `corotate observer`.
+#[derive(clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub struct ObserverArguments {
+    /// The observed body, if it is not the first one
+    #[arg(long, value_name = "NAME")]
+    pub body: Option<String>,
+    #[command(flatten)]
+    pub role: Arguments,
+}
+
+/// Runs the observer of a body, by default of the first one, to the end of the run.
+pub fn observer(arguments: &ObserverArguments) -> CommandResult {
+    let name = arguments.body.as_ref().map_or_else(|| "observer".to_owned(), |body| format!("observer-{body}"));
+    role(&name, &arguments.role)
+}
+
 /// Runs a role to the end of the run.
 pub fn role(name: &str, arguments: &Arguments) -> CommandResult {
     let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;

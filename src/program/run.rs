@@ -9,7 +9,7 @@ use super::perfetto;
 use super::scenario::{Change, changed, load, stem};
 use super::shipped::name;
 use super::signals::{catch_signals, die_with};
-use crate::config::{ClockKind, RunId};
+use crate::config::{BodyInfo, ClockKind, RunId};
 use crate::doctor::{self, Demand, Machine};
 use crate::files;
 use crate::hosts::{Address, HostEndpoint};
@@ -78,10 +78,10 @@ pub struct Arguments {
     /// Serve all signals to Foxglove (WebSocket) at IP:PORT; without ADDR at 127.0.0.1:8765
     #[arg(long, hide_short_help = true, value_name = "ADDR", num_args = 0..=1, default_missing_value = foxglove::ADDRESS, value_parser = foxglove::address)]
     foxglove: Option<SocketAddr>,
-    /// Be this host of the scenario, and wait for the others to join
+    /// Be this host of the scenario, and wait for the further to join
     #[arg(long, value_name = "NAME", requires = "listen", hide_short_help = true)]
     host: Option<String>,
-    /// Address for the others: quic/HOST:PORT, or tcp/ or udp/ on loopback
+    /// Address for the further: quic/HOST:PORT, or tcp/ or udp/ on loopback
     #[arg(long, value_name = "ADDR", requires = "host", hide_short_help = true)]
     listen: Option<Address>,
     #[command(flatten)]
@@ -348,12 +348,11 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
     // Replaces an older trace, in case this process is killed.
     arguments.trace_out.as_deref().map_or(Ok(()), |out| replace(out, b"", "--trace-out")).map_err(broken)?;
     let signal = catch_signals().map_err(broken)?;
-    let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
-    let fleets = fleets.map(|body| body.name.to_string()).collect();
+    let bodies = scenario.bodies.clone();
     let (level, events) = (Verbosity::new(arguments), arguments.events);
     let join_command = arguments.listen.as_ref().map(|address| arguments.keys.join_command(address));
     let mut screen =
-        Screen { bar: None, instructed: false, fleets, level, last_phase: String::new(), events, join_command };
+        Screen { bar: None, instructed: false, bodies, level, last_phase: String::new(), events, join_command };
     screen.print_verbose(format_args!("results go to {}", directory.display()));
     if scenario.clock == ClockKind::Realtime && screen.level > Verbosity::Quiet {
         warn_ungranted(scenario);
@@ -563,8 +562,8 @@ struct Screen {
     bar: Option<ProgressBar>,
     /// True once the user has instructions for missing roles or hosts.
     instructed: bool,
-    /// Bodies that are fleets; a device cannot replace them.
-    fleets: Vec<String>,
+    /// The bodies of the scenario; a device cannot replace a fleet.
+    bodies: Vec<BodyInfo>,
     level: Verbosity,
     /// The last printed phase.
     last_phase: String,
@@ -650,20 +649,22 @@ impl Screen {
 
     fn by_hand(&self, role: &str, domain: &Path) -> String {
         let (name, domain) = (name(), domain.display());
-        match role {
-            "observer" | "controller" if !self.fleets.is_empty() => format!("{name} {role} --domain {domain}"),
-            "observer" | "controller" => format!(
-                "{name} {role} --domain {domain}\nor connect a device with\n  \
-                 {name} bridge --serial PATH --role {role} --domain {domain}"
-            ),
-            body if body == "leader" || self.fleets.iter().any(|fleet| fleet == body) => {
-                format!("{name} plant --body {body} --domain {domain}")
+        let fleets = self.bodies.iter().any(|body| body.fleet.is_some());
+        let further = || self.bodies.iter().skip(1).filter(|body| body.observer.is_some());
+        let observed = further().find(|body| body.observer.as_deref() == Some(role));
+        let (command, device) = match (role, observed) {
+            ("observer", _) => (role.to_owned(), !fleets),
+            ("controller", _) => (role.to_owned(), !fleets && !further().any(|body| body.driven)),
+            (_, Some(body)) => (format!("observer --body {}", body.name), true),
+            (body, None) => {
+                let fleet = self.bodies.iter().any(|info| info.name == body && info.fleet.is_some());
+                (format!("plant --body {body}"), body != "leader" && !fleet)
             }
-            body => format!(
-                "{name} plant --body {body} --domain {domain}\nor connect a device with\n  \
-                 {name} bridge --serial PATH --role {body} --domain {domain}"
-            ),
-        }
+        };
+        let by_hand = format!("{name} {command} --domain {domain}");
+        let bridge =
+            || format!("\nor connect a device with\n  {name} bridge --serial PATH --role {role} --domain {domain}");
+        if device { by_hand + &bridge() } else { by_hand }
     }
 
     fn clear(&mut self) {

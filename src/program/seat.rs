@@ -49,7 +49,7 @@ pub fn seat(arguments: &Arguments) -> CommandResult {
         return Err(fail(Exit::Usage, NotExternal::OneProcess));
     }
     let role = RoleId::named(&scenario, &arguments.role).ok_or_else(|| {
-        let (role, known) = (arguments.role.clone(), scenario.rig.roles().join(", "));
+        let (role, known) = (arguments.role.clone(), scenario.roles().join(", "));
         fail(Exit::Usage, RoleError::NoSuchRole { role, known })
     })?;
     scenario.check_external(&arguments.role).map_err(|error| fail(Exit::Usage, error))?;

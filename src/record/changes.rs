@@ -29,7 +29,7 @@ pub(super) struct ChangeTap {
 impl ChangeTap {
     pub fn new(scenario: &Scenario) -> Self {
         Self {
-            port: ports(scenario, RoleId::Observer).input,
+            port: ports(scenario, RoleId::Observer(0)).input,
             scripted: scenario.inputs.scripted.clone(),
             received: scenario.inputs.received(),
             recorded: 0,

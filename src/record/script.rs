@@ -448,8 +448,9 @@ impl ScriptBuilder<'_> {
         let mut scripts = Vec::new();
         let inputs = std::mem::take(&mut self.inputs);
         for (number, input) in inputs.into_iter().enumerate() {
-            // Every input except a controller's estimate belongs to one output.
-            let output = if delay == 1 { None } else { number.checked_sub(1) };
+            // Every input of a controller except the first body's estimate belongs to the command of its body.
+            let commands = |output: &Track| output.info.body == input.track.info.body;
+            let output = if delay == 1 || number == 0 { None } else { self.outputs.iter().position(commands) };
             let output_ticks: Option<Vec<u64>> = output.map(|output| self.output_ticks(output));
             let (mut items, mut spans, mut at_tick, mut generation) = (Vec::new(), Vec::new(), 0, 1);
             let mut role_generation = 1;

@@ -14,7 +14,7 @@ use super::pictures::{by_unit, error_axis};
 use super::responses;
 use super::source::Source;
 use super::tables::figures_cells;
-use super::traces::{Key, MetricTrace, Traces, trace};
+use super::traces::{Key, MetricTrace, Traces, observer_name, trace};
 use crate::analysis::digits;
 use crate::launch::{MetricScore, StageFigures, Summary};
 use crate::record::{Comparison, RecordError, Recording, Tolerances, diff};
@@ -326,16 +326,17 @@ fn motion(runs: &[Run<'_>; 2], time: &Axis) -> Section {
     Section { id: "motion", title: "Motion", blocks }
 }
 
-/// Draws the truth of every body and the estimate of both runs over time.
+/// Draws the truths and the estimates of both runs over time.
 fn graph_figure(graph: &rig::Graph, runs: &[Run<'_>; 2], time: &Axis) -> Option<(Picture, String)> {
     let (mut lines, mut columns) = (Vec::new(), Vec::new());
     for run in runs {
         let Some(traces) = &run.traces else { continue };
-        let estimate = traces.bodies.first().map(|body| (body, "estimate", "observer"));
-        let truths = traces.bodies.iter().map(|body| (body, "truth", body.as_str()));
-        for (place, (body, signal, label)) in truths.chain(estimate).enumerate() {
+        let bodies = || traces.bodies.iter().enumerate();
+        let estimates = bodies().map(|(index, body)| (body, "estimate", observer_name(index, body)));
+        let truths = bodies().map(|(_, body)| (body, "truth", body.clone()));
+        for (place, (body, signal, label)) in truths.chain(estimates).enumerate() {
             if let Some(found) = traces.get(body, signal, graph.field, graph.element) {
-                lines.push(run.line(place, label, found));
+                lines.push(run.line(place, &label, found));
                 columns.push(found);
             }
         }

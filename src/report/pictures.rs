@@ -7,7 +7,7 @@ use super::error::ReportError;
 use super::frame::Line;
 use super::model::{Block, Section};
 use super::source::Source;
-use super::traces::{BODIES_SHOWN, Key, MetricTrace, Traces};
+use super::traces::{BODIES_SHOWN, Key, MetricTrace, Traces, observer_name};
 use crate::analysis::digits;
 use crate::rig;
 use crate::scenario::Scenario;
@@ -19,6 +19,8 @@ const ERROR_FLOOR: f64 = 1e-18;
 const LYAPUNOV_FLOOR: f64 = 1e-34;
 /// The classes of colour and dash pattern of the driven bodies.
 const FOLLOWERS: [&str; BODIES_SHOWN] = ["o d0 wide", "g d3 wide", "p d4 wide", "y d1 wide"];
+/// Line classes of the estimates of driven bodies.
+const OBSERVERS: [&str; BODIES_SHOWN] = ["o d1", "g d1", "p d1", "y d0"];
 /// The classes of colour and dash pattern of components and metrics.
 const COMPONENTS: [&str; 4] = ["o d0", "b d1", "g d3", "p d4"];
 /// The decades of lateness from the lightest to the darkest shade, starting at 1 µs.
@@ -135,14 +137,22 @@ fn present<'a>(
     lines.into_iter().flatten().unzip()
 }
 
-/// Draws the paths of all bodies and of the observer in a plane.
+/// Returns the drawn bodies after the first, with the names of their observers and the line classes of their estimates.
+fn further_observed(traces: &Traces) -> impl Iterator<Item = (&String, String, &'static str)> {
+    let bodies = traces.bodies.iter().enumerate().skip(1).zip(OBSERVERS);
+    bodies.map(|((index, body), class)| (body, observer_name(index, body), class))
+}
+
+/// Draws the paths of all bodies and observers in a plane.
 fn paths(traces: &Traces, name: &'static str) -> Vec<Line> {
     let path = |owner: &str, class, label: &str| {
         traces.paths.get(&(owner.to_owned(), name)).map(|columns| Line::path(class, label, columns))
     };
     let followers = traces.bodies.iter().skip(1).zip(FOLLOWERS).map(|(body, class)| path(body, class, body));
     let leader = traces.bodies.first().map(String::as_str).unwrap_or_default();
-    followers.chain([path(leader, "k d0", leader), path("observer", "b d1", "observer")]).flatten().collect()
+    let estimates = further_observed(traces).map(|(_, name, class)| path(&name, class, &name));
+    let first = [path(leader, "k d0", leader), path("observer", "b d1", "observer")];
+    followers.chain(estimates).chain(first).flatten().collect()
 }
 
 /// Draws a plane with all paths, or with the path of the observed body and its reference.
@@ -161,7 +171,7 @@ fn plane_figure(view: &rig::Plane, traces: &Traces, full: Option<&Traces>) -> Op
     (!lines.is_empty()).then(|| (plane(view.title, view.axes, &lines, view.centred), caption.to_owned()))
 }
 
-/// Draws an element of a field over time: of every body, of the estimate and of the reference run.
+/// Draws an element of a field over time: of every body, of the estimates and of the reference run.
 fn graph_figure(
     graph: &rig::Graph,
     traces: &Traces,
@@ -177,6 +187,9 @@ fn graph_figure(
     let compared = compared.map(|columns| line("k d0", COMPARED, columns));
     let followers = traces.bodies.iter().skip(1).zip(FOLLOWERS).map(|(body, class)| {
         traces.get(body, "truth", graph.field, graph.element).map(|columns| line(class, body, columns))
+    });
+    let estimates = further_observed(traces).map(|(body, name, class)| {
+        traces.get(body, "estimate", graph.field, graph.element).map(|columns| line(class, &name, columns))
     });
     let own = traces.get(first, "truth", graph.field, graph.element);
     let own = own.map(|columns| line(own_classes[0], own_label, columns));
@@ -194,7 +207,8 @@ fn graph_figure(
     if !learned {
         return None;
     }
-    let (columns, lines) = present([noisy].into_iter().chain(followers).chain([compared, own, estimate]));
+    let (columns, lines) =
+        present([noisy].into_iter().chain(followers).chain(estimates).chain([compared, own, estimate]));
     let y = Axis::around(&graph.axis, range(columns, false));
     (!lines.is_empty()).then(|| (over_time(&graph.title, time, &y, &lines), graph.caption.clone()))
 }

@@ -39,10 +39,15 @@ pub struct Traces {
     pub roles: Vec<RoleTrace>,
     /// The number of ticks with all samples that the metrics need.
     pub scored_ticks: u64,
-    /// The number of ticks at which the estimate reported a degraded status, by status.
+    /// The number of ticks at which the first body's estimate reported a degraded status, by status.
     pub unseen: BTreeMap<&'static str, Columns<Count>>,
     /// The responses to the given steps.
     pub windows: Vec<WindowTrace>,
+}
+
+/// Returns the name under which the estimate of a body is drawn: that of its observer.
+pub fn observer_name(index: usize, body: &str) -> String {
+    if index == 0 { "observer".to_owned() } else { format!("observer-{body}") }
 }
 
 /// The status bits of a degraded estimate.
@@ -108,10 +113,10 @@ struct Field {
     traces: Vec<(Key, Columns<Extremes>)>,
 }
 
-/// The truths of all bodies and the estimate of a tick that is still incomplete.
+/// The truths of all bodies and the estimates of a tick that is still incomplete, by body.
 struct Pending {
     truths: Vec<Option<Vec<u64>>>,
-    estimate: Option<Vec<u64>>,
+    estimates: Vec<Option<Vec<u64>>>,
 }
 
 /// Views of samples with the inputs of their tick. Each of them sees its ticks in order.
@@ -132,6 +137,8 @@ impl Views {
 
 struct Tracer {
     rig: Arc<dyn AnyRig>,
+    /// True for each body with an observer.
+    observed: Vec<bool>,
     views: Views,
     tick_s: f64,
     settled_by_s: f64,
@@ -167,6 +174,7 @@ impl Tracer {
         let signals = recording.signals().iter().map(|signal| SignalTrace::new(&**rig, signal, &mut traces)).collect();
         Self {
             rig: rig.clone(),
+            observed: scenario.bodies.iter().map(|body| body.observer.is_some()).collect(),
             views: Views::new(scenario),
             tick_s: info.period_ns as f64 / 1e9,
             settled_by_s: scenario.accept.settled_by_s,
@@ -247,8 +255,10 @@ impl Tracer {
             }
             Some(Signal::Estimate) => {
                 self.path(body, tick, sample, index);
-                self.unseen(tick, self.signals[index].status.map_or(0, |word| words[word]));
-                self.keep(tick, |pending| pending.estimate = Some(words));
+                if body == 0 {
+                    self.unseen(tick, self.signals[index].status.map_or(0, |word| words[word]));
+                }
+                self.keep(tick, |pending| pending.estimates[body] = Some(words));
             }
             Some(Signal::Command) => self.fall(body, tick, &words),
             _ => {}
@@ -256,7 +266,7 @@ impl Tracer {
         true
     }
 
-    /// Counts the degraded status bits of an estimate.
+    /// Counts the degraded status bits of the first body's estimate.
     fn unseen(&mut self, tick: u64, status: u64) {
         for (name, _) in status::NAMES.into_iter().filter(|(_, bit)| status & UNSEEN & bit != 0) {
             self.traces.unseen.entry(name).or_default().at(tick).0 += 1;
@@ -264,11 +274,14 @@ impl Tracer {
     }
 
     fn keep(&mut self, tick: u64, put: impl FnOnce(&mut Pending)) {
-        let bodies = self.rig.bodies().len();
-        let blank = || Pending { truths: vec![None; bodies], estimate: None };
+        let bodies = self.observed.len();
+        let blank = || Pending { truths: vec![None; bodies], estimates: vec![None; bodies] };
         let pending = self.pending.entry(tick).or_insert_with(blank);
         put(pending);
-        if pending.estimate.is_some() && pending.truths.iter().all(Option::is_some) {
+        let mut estimates = pending.estimates.iter().zip(&self.observed);
+        if estimates.all(|(estimate, observed)| estimate.is_some() || !observed)
+            && pending.truths.iter().all(Option::is_some)
+        {
             if let Some(whole) = self.pending.remove(&tick) {
                 self.traces.scored_ticks += 1;
                 self.score(tick, &whole, true);
@@ -284,7 +297,7 @@ impl Tracer {
     fn score(&mut self, tick: u64, pending: &Pending, complete: bool) {
         let words = |body: usize, signal| match signal {
             Signal::Truth => pending.truths[body].as_deref(),
-            Signal::Estimate => pending.estimate.as_deref(),
+            Signal::Estimate => pending.estimates[body].as_deref(),
             _ => None,
         };
         let view = if complete { &mut self.views.complete } else { &mut self.views.incomplete };
@@ -327,7 +340,7 @@ impl Tracer {
     /// Adds a point to the paths of a body or an estimate in all planes.
     fn path(&mut self, body: usize, tick: u64, sample: &[u8], index: usize) {
         let owner = match self.signals[index].kind {
-            Some(Signal::Estimate) => "observer".to_owned(),
+            Some(Signal::Estimate) => observer_name(body, &self.traces.bodies[body]),
             _ => self.traces.bodies[body].clone(),
         };
         let fields = &self.signals[index].fields;

@@ -192,12 +192,16 @@ impl Feed {
                 taps.push(Tap::open(bus, port)?);
             }
         }
-        let find = |signal| taps.iter().position(|tap: &Tap| tap.topic.signal == signal);
+        let bodies = &scenario.bodies;
+        let find = |signal, body: usize| {
+            let sought = |tap: &Tap| tap.topic.signal == signal && tap.topic.body == bodies[body].name;
+            taps.iter().position(sought)
+        };
         for (role, output) in RoleId::all(scenario).into_iter().zip(outputs) {
             let input = match role {
                 RoleId::Plant(_) => None,
-                RoleId::Observer => find(Signal::Measurement),
-                RoleId::Controller => find(Signal::Estimate),
+                RoleId::Observer(body) => find(Signal::Measurement, body),
+                RoleId::Controller => find(Signal::Estimate, 0),
             };
             let health = bus.reader(&topic(scenario, role.name(scenario), Signal::Health), Reader::Role)?;
             roles.push(RoleFeed { health, output, input, reported_missed: 0, reported_s: f64::NEG_INFINITY });
@@ -332,7 +336,7 @@ impl Feed {
         }
     }
 
-    /// Scores the newest tick with all truths and the estimate.
+    /// Scores the newest tick with all truths and estimates.
     fn score(&mut self, model: &mut Model) {
         let taps = &self.taps;
         let with_signal = |signal| taps.iter().filter(move |tap| tap.topic.signal == signal);

@@ -653,7 +653,7 @@ fn a_replay_is_limited_where_neither_samples_nor_counters_show_what_was_executed
         let mut run = Scheduled::new(&scenario, &bus, &file);
         for tick in 0..=scenario.last_tick {
             for index in 0..4 {
-                if run.roles[index] != RoleId::Observer || !held.contains(&tick) {
+                if run.roles[index] != RoleId::Observer(0) || !held.contains(&tick) {
                     run.execute(index, tick);
                 }
             }

@@ -331,7 +331,7 @@ fn a_process_of_several_roles_does_not_allocate() {
 #[test]
 fn a_bridge_to_a_device_does_not_allocate() {
     let (name, text) = corotate::config::SHIPPED[0];
-    for roles in [&[RoleId::Plant(1)][..], &[RoleId::Observer, RoleId::Controller]] {
+    for roles in [&[RoleId::Plant(1)][..], &[RoleId::Observer(0), RoleId::Controller]] {
         let counts = counts(text, roles, "[]");
         assert!(roles.len() > 1 || counts.iter().any(|(report, _)| report.role == "follower" && report.line.is_some()));
         assert_no_allocation(name, counts);

@@ -248,7 +248,7 @@ fn run(scenario: &Scenario) -> Trace {
             truths.iter_mut().for_each(|truth| assert!(truth.advance().unwrap()));
             estimate.advance().unwrap();
             let mut values = vec![0.0; rig.metrics().len()];
-            rig.score(|index| truths[index].sample(), |_| None, estimate.sample(), &[], &mut values);
+            rig.score(|index| truths[index].sample(), |_| None, |_| estimate.sample(), &[], &mut values);
             errors.push(values);
             let words = corotate::sample::Message::words(truths[0].sample().unwrap());
             let components = |field: &&corotate::sample::Field| words[field.offset / 8..][..field.count].to_vec();

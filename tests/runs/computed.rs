@@ -44,7 +44,7 @@ impl Laws {
             // In real time a measurement may be missing.
             if let Some(words) = input {
                 let measurement: &Measurement<R> = from_bytes(bytemuck::cast_slice(words));
-                controller.step(estimate, measurement, &mut command);
+                controller.step(estimate, None, measurement, &mut command);
             }
             assert_eq!(bytes_of(&command).len(), 8 * command.words().len());
             command.words()[4..].to_vec()

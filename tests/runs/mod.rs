@@ -13,6 +13,7 @@ mod hil;
 mod hosts;
 mod inputs;
 mod late;
+mod observed;
 mod one_plant;
 mod one_process;
 mod overrun;

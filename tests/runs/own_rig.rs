@@ -219,34 +219,39 @@ fn corotate_new_writes_an_example_under_another_name() {
     }
 }
 
+/// Builds a program from a source and the file of its scenario. The crate is otherwise that of the example.
+pub fn built(name: &str, source: &str, scenario: (&str, &str)) -> PathBuf {
+    let example = root().join("examples/motor-pair");
+    let profile = Path::new(env!("CARGO_BIN_EXE_corotate")).parent().unwrap();
+    let directory = profile.join(format!("{name}-crate"));
+    std::fs::create_dir_all(directory.join("src")).unwrap();
+    let crate_path = format!("path = \"{}\"", root().display());
+    for file in ["Cargo.toml", "Cargo.lock"] {
+        let text = std::fs::read_to_string(example.join(file)).unwrap();
+        let text = text.replace("motor-pair", name).replace("path = \"../..\"", &crate_path);
+        std::fs::write(directory.join(file), text).unwrap();
+    }
+    std::fs::write(directory.join(scenario.0), scenario.1).unwrap();
+    std::fs::write(directory.join("src/main.rs"), source).unwrap();
+    let mut command = Command::new(env!("CARGO"));
+    command.args(["build", "--manifest-path", directory.join("Cargo.toml").to_str().unwrap()]);
+    command.args(["--offline", "--target-dir", profile.parent().unwrap().to_str().unwrap()]);
+    command.args((!cfg!(debug_assertions)).then_some("--release"));
+    let built = command.output().unwrap();
+    assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
+    profile.join(name)
+}
+
 /// Builds a copy of the example whose law panics at tick 500 in the way that the variable `PANIC` selects.
 fn panicking() -> &'static Path {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
     PROGRAM.get_or_init(|| {
         let example = root().join("examples/motor-pair");
-        let profile = Path::new(env!("CARGO_BIN_EXE_corotate")).parent().unwrap();
-        let directory = profile.join("motor-panics-crate");
-        std::fs::create_dir_all(directory.join("src")).unwrap();
-        let copy = |file: &str, change: &dyn Fn(String) -> String| {
-            let text = std::fs::read_to_string(example.join(file)).unwrap();
-            std::fs::write(directory.join(file), change(text)).unwrap();
-        };
-        let crate_path = format!("path = \"{}\"", root().display());
-        copy("Cargo.toml", &|text| text.replace("motor-pair", "motor-panics").replace("path = \"../..\"", &crate_path));
-        copy("Cargo.lock", &|text| text.replace("motor-pair", "motor-panics"));
-        copy("motor-pair.toml", &|text| text);
-        copy("src/main.rs", &|text| {
-            let law = "let rise = leader.rise_rad_s2";
-            assert!(text.contains(law));
-            text.replace(law, &format!("fail(own.stamp.tick);\n        {law}")) + PANICS
-        });
-        let mut command = Command::new(env!("CARGO"));
-        command.args(["build", "--manifest-path", directory.join("Cargo.toml").to_str().unwrap()]);
-        command.args(["--offline", "--target-dir", profile.parent().unwrap().to_str().unwrap()]);
-        command.args((!cfg!(debug_assertions)).then_some("--release"));
-        let built = command.output().unwrap();
-        assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
-        profile.join("motor-panics")
+        let text = |file: &str| std::fs::read_to_string(example.join(file)).unwrap();
+        let (source, law) = (text("src/main.rs"), "let rise = leader.rise_rad_s2");
+        assert!(source.contains(law));
+        let source = source.replace(law, &format!("fail(own.stamp.tick);\n        {law}")) + PANICS;
+        built("motor-panics", &source, ("motor-pair.toml", &text("motor-pair.toml")))
     })
 }
 

@@ -235,7 +235,7 @@ fn a_served_controller_follows_the_inputs_and_equals_the_built_in_one_bit_by_bit
         let estimate: &Estimate<R> = from_bytes(bytemuck::cast_slice(&estimate));
         let measured: &Measurement<R> = from_bytes(bytemuck::cast_slice(&measured));
         let mut command = Acceleration::<R>::default();
-        controller.step(estimate, measured, &mut command);
+        controller.step(estimate, None, measured, &mut command);
         command.words()[STAMP..].to_vec()
     });
     assert_eq!((ended.as_str(), client.exit_code()), ("", Some(0)));

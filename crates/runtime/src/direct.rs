@@ -8,7 +8,7 @@ use crate::bus::Signal;
 use crate::clock::Grid;
 use crate::config::{BodyInfo, Settings};
 use crate::control::WatchBounds;
-use crate::rig::{Estimate, Rig, RigLoopBody, loop_body, observer};
+use crate::rig::{Estimate, Rig, RigLoopBody, further_observer, loop_body, observer};
 use crate::role::{Guard, Observer, command_index, cycle};
 use crate::runtime::{RoleId, ports};
 use crate::sample::{Message, Stamp};
@@ -26,6 +26,14 @@ struct Judge<R: Rig> {
     command_guard: R::CommandGuard,
     /// The state hashes of the measurements, the truths and the commands.
     hashes: [u64; 3],
+    estimates: Option<EstimateJudge<R>>,
+}
+
+/// The guards and the hash of the estimates of another body than the first.
+struct EstimateJudge<R: Rig> {
+    measurement_guard: R::MeasurementGuard,
+    estimate_guard: R::EstimateGuard,
+    hash: u64,
 }
 
 /// Returns true if a run of this scenario may be a direct one.
@@ -43,7 +51,11 @@ pub(crate) fn run_rig<R: Rig>(
     checkpoints: bool,
     proceed: &mut dyn FnMut(u64, f64) -> bool,
 ) -> Option<(Vec<RoleReport>, Score)> {
-    is_plain(scenario).then(|| Run::new(rig, scenario, checkpoints).run(proceed)).flatten()
+    if !is_plain(scenario) {
+        return None;
+    }
+    let run = Run::new(rig, scenario, checkpoints);
+    if run.further_observed() { run.run::<true>(proceed) } else { run.run::<false>(proceed) }
 }
 
 struct Run<'a, R: Rig> {
@@ -55,7 +67,7 @@ struct Run<'a, R: Rig> {
     measurement_guard: R::MeasurementGuard,
     estimate: Estimate<R>,
     estimate_hash: u64,
-    /// Of the estimates, then of each body as in [`Judge`].
+    /// Of the first body's estimates, then of each body as in [`Judge`], then of the other estimates.
     checkpoints: CommonCheckpoints,
     /// One guard for controller and scorer: both judge the same samples.
     estimate_guard: R::EstimateGuard,
@@ -64,6 +76,7 @@ struct Run<'a, R: Rig> {
 
 impl<'a, R: Rig> Run<'a, R> {
     fn new(rig: &R, scenario: &'a Settings, checkpoints: bool) -> Self {
+        let further_observers = scenario.bodies.iter().skip(1).filter(|body| body.observer.is_some()).count();
         let body = |(index, info): (usize, &BodyInfo)| {
             loop_body(rig, index, info.driven, scenario.actuation(info.driven), scenario)
         };
@@ -71,6 +84,11 @@ impl<'a, R: Rig> Run<'a, R> {
             measurement_guard: rig.measurement_guard(index, true),
             command_guard: rig.command_guard(index),
             hashes: [0; 3],
+            estimates: further_observer(rig, index, scenario).map(|_| EstimateJudge {
+                measurement_guard: rig.measurement_guard(index, false),
+                estimate_guard: rig.estimate_guard(),
+                hash: 0,
+            }),
         };
         Self {
             scenario,
@@ -81,16 +99,27 @@ impl<'a, R: Rig> Run<'a, R> {
             measurement_guard: rig.measurement_guard(0, false),
             estimate: Estimate::<R>::default(),
             estimate_hash: 0,
-            checkpoints: CommonCheckpoints::new(1 + 3 * rig.bodies().len(), checkpoints.then_some(scenario.last_tick)),
+            checkpoints: CommonCheckpoints::new(
+                1 + 3 * rig.bodies().len() + further_observers,
+                checkpoints.then_some(scenario.last_tick),
+            ),
             estimate_guard: rig.estimate_guard(),
             scoring: Scoring::new(rig, scenario, false),
         }
     }
 
-    fn run(mut self, proceed: &mut dyn FnMut(u64, f64) -> bool) -> Option<(Vec<RoleReport>, Score)> {
+    /// Returns true if bodies other than the first have observers.
+    fn further_observed(&self) -> bool {
+        self.judges.iter().any(|judge| judge.estimates.is_some())
+    }
+
+    fn run<const FURTHER: bool>(
+        mut self,
+        proceed: &mut dyn FnMut(u64, f64) -> bool,
+    ) -> Option<(Vec<RoleReport>, Score)> {
         let mut ticks = 0;
         for tick in 0..=self.scenario.last_tick {
-            if !self.tick(tick) {
+            if !self.tick::<FURTHER>(tick) {
                 return None;
             }
             ticks = tick + 1;
@@ -98,16 +127,16 @@ impl<'a, R: Rig> Run<'a, R> {
                 break;
             }
         }
-        let score = self.scoring.finish(core::iter::repeat_n(ticks, self.bodies.len() + 1));
+        let score = self.scoring.finish(core::iter::repeat(ticks));
         let reports = RoleId::all(self.scenario).into_iter().map(|role| self.report(role, ticks)).collect();
         Some((reports, score))
     }
 
     /// Runs one tick of all roles. Returns false if a node would have had a choice.
     #[inline]
-    fn tick(&mut self, tick: u64) -> bool {
+    fn tick<const FURTHER: bool>(&mut self, tick: u64) -> bool {
         let stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), generation: 1, ..Stamp::default() };
-        if !cycle(&stamp, &mut self.observer, &mut self.estimate, &mut self.bodies)
+        if !cycle::<FURTHER, _, _, _, _>(&stamp, &mut self.observer, &mut self.estimate, &mut self.bodies)
             || !self.measurement_guard.accepts(&self.bodies[0].measurement)
             || !self.estimate_guard.accepts(&self.estimate)
         {
@@ -133,9 +162,42 @@ impl<'a, R: Rig> Run<'a, R> {
                 self.checkpoints.store(&judge.hashes);
             }
         }
-        let bodies = &self.bodies;
-        self.scoring.take(|body| Some(&bodies[body].truth), |_| None, Some(&self.estimate), true);
+        if FURTHER && !self.judge_further(tick, keeps) {
+            return false;
+        }
+        let (bodies, first) = (&self.bodies, &self.estimate);
+        let estimate = |body: usize| {
+            let further = || bodies[body].observed.as_ref().map(|observed| &observed.estimate);
+            if body == 0 { Some(first) } else { further().filter(|_| FURTHER) }
+        };
+        self.scoring.take(|body| Some(&bodies[body].truth), |_| None, estimate, true);
         true
+    }
+
+    /// Judges and hashes the estimates of other bodies than the first. Returns false if a node would have had a choice.
+    fn judge_further(&mut self, tick: u64, keeps: bool) -> bool {
+        for (body, judge) in self.bodies.iter().zip(&mut self.judges) {
+            let (Some(observed), Some(judge)) = (&body.observed, &mut judge.estimates) else { continue };
+            if !judge.measurement_guard.accepts(&body.measurement) || !judge.estimate_guard.accepts(&observed.estimate)
+            {
+                return false;
+            }
+            judge.hash = chained(judge.hash, tick, observed.estimate.content());
+            if keeps {
+                self.checkpoints.store(&[judge.hash]);
+            }
+        }
+        true
+    }
+
+    /// Runs the roles without guards, hashes, counters and score.
+    fn roles_alone<const FURTHER: bool>(self) {
+        let Run { mut bodies, mut observer, mut estimate, .. } = self;
+        for tick in 0..=self.scenario.last_tick {
+            let stamp = Stamp { tick, generation: 1, ..Stamp::default() };
+            let bodies = black_box(&mut bodies[..]);
+            black_box(cycle::<FURTHER, _, _, _, _>(&stamp, &mut observer, &mut estimate, bodies));
+        }
     }
 
     /// Returns the report of a role that executed every tick on every input.
@@ -184,7 +246,13 @@ impl<'a, R: Rig> Run<'a, R> {
     fn checkpoints(&self, name: &str, signal: Signal) -> Checkpoints {
         let index = self.scenario.bodies.iter().position(|body| body.name == name).unwrap_or(0);
         let kind = match signal {
-            Signal::Estimate => return self.checkpoints.of_signal(0, self.estimate_hash),
+            Signal::Estimate => match &self.judges[index].estimates {
+                None => return self.checkpoints.of_signal(0, self.estimate_hash),
+                Some(own) => {
+                    let before = self.judges[..index].iter().filter(|judge| judge.estimates.is_some()).count();
+                    return self.checkpoints.of_signal(1 + 3 * self.judges.len() + before, own.hash);
+                }
+            },
             Signal::Measurement => 0,
             Signal::Command => 2,
             _ => 1,
@@ -197,11 +265,12 @@ impl<'a, R: Rig> Run<'a, R> {
 /// Returns `None` for a loop with a fleet.
 pub(crate) fn roles_alone<R: Rig>(rig: &R, scenario: &Settings) -> Option<f64> {
     is_plain(scenario).then(|| {
-        let Run { mut bodies, mut observer, mut estimate, .. } = Run::new(rig, scenario, false);
+        let run = Run::new(rig, scenario, false);
         let began = Instant::now();
-        for tick in 0..=scenario.last_tick {
-            let stamp = Stamp { tick, generation: 1, ..Stamp::default() };
-            black_box(cycle(&stamp, &mut observer, &mut estimate, black_box(&mut bodies)));
+        if run.further_observed() {
+            run.roles_alone::<true>()
+        } else {
+            run.roles_alone::<false>()
         }
         (scenario.last_tick + 1) as f64 / began.elapsed().as_secs_f64()
     })

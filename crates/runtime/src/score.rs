@@ -138,6 +138,11 @@ fn take_input<R: Rig>(rig: &mut R, reference: &mut [f64], new: NewValue<'_>) {
     }
 }
 
+/// Returns the observed bodies but the first, with their indices.
+fn further_observed(scenario: &Settings) -> impl Iterator<Item = (usize, &BodyInfo)> {
+    scenario.bodies.iter().enumerate().skip(1).filter(|(_, body)| body.observer.is_some())
+}
+
 /// Opens the scorer of a rig.
 pub(crate) fn score_rig<R: Rig, B: Bus + 'static>(
     rig: &R,
@@ -260,9 +265,14 @@ impl<R: Rig, B: Bus> TruthInput<R, B> {
     }
 }
 
+/// The estimate signal of a body.
+type EstimateInput<R, B> = Input<B, Estimate<R>, <R as Rig>::EstimateGuard>;
+
 struct RigScorer<R: Rig, B: Bus> {
     truths: Vec<TruthInput<R, B>>,
-    estimate: Input<B, Estimate<R>, R::EstimateGuard>,
+    estimate: EstimateInput<R, B>,
+    /// The estimates of other bodies than the first, with the indices of these.
+    further_estimates: Vec<(usize, EstimateInput<R, B>)>,
     last_tick: u64,
     scoring: Scoring<R>,
 }
@@ -279,8 +289,10 @@ pub(crate) struct Scoring<R: Rig> {
     tick_s: f64,
     delay_ticks: u64,
     driven: Vec<DrivenBody>,
-    /// The status counts of the estimate, then of every body's truth.
+    /// The status counts of the first body's estimate, then of every body's truth.
     statuses: Vec<Statuses>,
+    /// The status counts of the other estimates, with the indices of their bodies.
+    further_statuses: Vec<(usize, Statuses)>,
     services: Vec<String>,
     next_tick: u64,
     /// Per incident: its number, its tick, and the last tick since at which some metric was not known to be within its limit.
@@ -297,8 +309,10 @@ impl<R: Rig> Scoring<R> {
         let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven && body.fleet.is_none());
         let estimates = Statuses::new(&rig.bodies()[0].name, Signal::Estimate);
         let truths = bodies.clone().map(|body| Statuses::new(&body.name, Signal::Truth));
+        let further = || further_observed(scenario).map(|(index, body)| (index, &body.name));
         let names = bodies.clone().map(|body| (&body.name, Signal::Truth));
         let signals = core::iter::once((&rig.bodies()[0].name, Signal::Estimate)).chain(names);
+        let signals = signals.chain(further().map(|(_, name)| (name, Signal::Estimate)));
         let metric = |name: &&str| MetricScore {
             name: (*name).to_owned(),
             last: f64::NAN,
@@ -326,6 +340,7 @@ impl<R: Rig> Scoring<R> {
                 .map(|(body, _)| DrivenBody { body, bounded: rig.bound_applies(body), before: None })
                 .collect(),
             statuses: core::iter::once(estimates).chain(truths).collect(),
+            further_statuses: further().map(|(index, name)| (index, Statuses::new(name, Signal::Estimate))).collect(),
             services: signals.map(|(body, signal)| topic(scenario, body, signal).to_string()).collect(),
             next_tick: 0,
             incidents: Vec::new(),
@@ -355,7 +370,7 @@ impl<R: Rig> Scoring<R> {
         &mut self,
         truth: impl Fn(usize) -> Option<&'a Truth<R>> + Copy,
         fleet: impl Fn(usize) -> Option<&'a FleetTruth<R>>,
-        estimate: Option<&Estimate<R>>,
+        estimate: impl Fn(usize) -> Option<&'a Estimate<R>> + Copy,
         complete: bool,
     ) {
         let tick = self.next_tick;
@@ -382,7 +397,10 @@ impl<R: Rig> Scoring<R> {
         {
             *last = tick;
         }
-        let (estimates, truths) = self.statuses.split_at_mut(1);
+        for (body, statuses) in &mut self.further_statuses {
+            estimate(*body).into_iter().for_each(|estimate| statuses.take(estimate));
+        }
+        let (estimate, (estimates, truths)) = (estimate(0), self.statuses.split_at_mut(1));
         estimate.iter().for_each(|estimate| estimates[0].take(*estimate));
         let per_body = truths.iter_mut().enumerate();
         per_body.for_each(|(body, statuses)| truth(body).iter().for_each(|truth| statuses.take(*truth)));
@@ -451,7 +469,8 @@ impl<R: Rig> Scoring<R> {
         self.incidents.iter().filter_map(recovery).collect()
     }
 
-    /// Completes the score. `received` yields the sample counts of the estimate, then of every body's truth.
+    /// Completes the score. `received` yields the sample counts of the first estimate, then of every body's truth, then of the other
+    /// estimates.
     pub fn finish(&mut self, received: impl Iterator<Item = u64>) -> Score {
         let services = self.services.iter().cloned();
         self.score.received = services.zip(received).collect();
@@ -467,7 +486,8 @@ impl<R: Rig> Scoring<R> {
                 statuses.named().map(|(name, ticks)| (name.to_owned(), ticks)).collect::<BTreeMap<_, _>>(),
             )
         };
-        self.score.statuses = self.statuses.iter().map(named).filter(|(_, counts)| !counts.is_empty()).collect();
+        let statuses = self.statuses.iter().chain(self.further_statuses.iter().map(|(_, statuses)| statuses));
+        self.score.statuses = statuses.map(named).filter(|(_, counts)| !counts.is_empty()).collect();
         let (tick_s, ticks) = (self.tick_s, self.next_tick);
         for metric in &mut self.score.metrics {
             let first_within = metric.last_above.map_or(0, |tick| tick + 1);
@@ -481,14 +501,20 @@ impl<R: Rig> Scoring<R> {
 impl<R: Rig, B: Bus> RigScorer<R, B> {
     fn open(rig: &R, scenario: &Settings, bus: &B) -> Result<Self, BusError> {
         // Guard and lateness are those of the roles: a sample that they refuse is not scored.
-        let mut estimate = Input::open(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?
-            .with_late(LateSamples::for_signal(scenario, Signal::Estimate, &rig.bodies()[0].name))
-            .with_guard(rig.estimate_guard());
-        estimate.expect(crate::runtime::accepted_ticks(scenario, None));
+        let estimate = |body: &BodyInfo| {
+            let topic = topic(scenario, &body.name, Signal::Estimate);
+            let late = LateSamples::for_signal(scenario, Signal::Estimate, &body.name);
+            let input = Input::open(bus, &topic, Reader::Scorer)?.with_late(late);
+            let mut input = input.with_guard(rig.estimate_guard());
+            input.expect(crate::runtime::accepted_ticks(scenario, None));
+            Ok(input)
+        };
+        let further = further_observed(scenario).map(|(index, body)| Ok((index, estimate(body)?)));
         let truth = |body: &BodyInfo| TruthInput::open(bus, &topic(scenario, &body.name, Signal::Truth), body.fleet);
         Ok(Self {
             truths: rig.bodies().iter().map(truth).collect::<Result<_, _>>()?,
-            estimate,
+            estimate: estimate(&scenario.bodies[0])?,
+            further_estimates: further.collect::<Result<_, BusError>>()?,
             last_tick: scenario.last_tick,
             scoring: Scoring::new(rig, scenario, true),
         })
@@ -498,24 +524,36 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
     fn settled(&mut self) -> Result<bool, BusError> {
         let next = self.scoring.next_tick;
         let mut waiting = self.estimate.seek(next)? == Seek::NotYet;
+        for (_, estimate) in &mut self.further_estimates {
+            waiting = waiting || estimate.seek(next)? == Seek::NotYet;
+        }
         for truth in &mut self.truths {
             waiting = waiting || truth.seek(next)? == Seek::NotYet;
         }
         Ok(!waiting)
     }
 
+    fn estimates(&mut self) -> impl Iterator<Item = &mut EstimateInput<R, B>> {
+        std::iter::once(&mut self.estimate).chain(self.further_estimates.iter_mut().map(|(_, estimate)| estimate))
+    }
+
     /// Connects every input to its current writer: a writer that ends unconnected takes its samples with it.
     fn connect(&mut self) {
-        self.estimate.refresh();
+        self.estimates().for_each(Input::refresh);
         self.truths.iter_mut().for_each(TruthInput::refresh);
     }
 
     fn score_tick(&mut self) {
         let tick = self.scoring.next_tick;
-        let estimate = at(&self.estimate, tick);
-        let complete =
-            estimate.is_some() && self.truths.iter().all(|truth| truth.stamp().is_some_and(|stamp| stamp.tick == tick));
-        let truths = &self.truths;
+        let (truths, first, further) = (&self.truths, at(&self.estimate, tick), &self.further_estimates);
+        let arrived = |(_, estimate): &(usize, EstimateInput<R, B>)| at(estimate, tick).is_some();
+        let complete = first.is_some()
+            && further.iter().all(arrived)
+            && truths.iter().all(|truth| truth.stamp().is_some_and(|stamp| stamp.tick == tick));
+        let estimate = |body: usize| match body {
+            0 => first,
+            _ => further.iter().find(|(index, _)| *index == body).and_then(|(_, estimate)| at(estimate, tick)),
+        };
         self.scoring.take(
             |body| truths[body].body_sample(tick),
             |body| truths[body].fleet_sample(tick),
@@ -607,7 +645,7 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
     fn start(&mut self, grid: Grid) {
         let accepted_ticks = AcceptedTicks::Due(grid);
         self.truths.iter_mut().for_each(|truth| truth.expect(accepted_ticks));
-        self.estimate.expect(accepted_ticks);
+        self.estimates().for_each(|estimate| estimate.expect(accepted_ticks));
     }
 
     fn incident(&mut self, id: u64, tick: u64) {
@@ -619,7 +657,9 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
         loop {
             self.poll(u64::MAX)?;
             let newest = |tick: Option<u64>| tick.is_some_and(|tick| tick >= self.scoring.next_tick);
-            let more = newest(self.estimate.last_tick()) || self.truths.iter().any(|truth| newest(truth.last_tick()));
+            let more = newest(self.estimate.last_tick())
+                || self.further_estimates.iter().any(|(_, estimate)| newest(estimate.last_tick()))
+                || self.truths.iter().any(|truth| newest(truth.last_tick()));
             if !more || self.next_tick() > self.last_tick {
                 break;
             }
@@ -627,7 +667,8 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
         }
         let estimates = self.estimate.counters().samples();
         let truths = self.truths.iter_mut().map(TruthInput::samples);
-        Ok(self.scoring.finish(core::iter::once(estimates).chain(truths)))
+        let further = self.further_estimates.iter_mut().map(|(_, estimate)| estimate.counters().samples());
+        Ok(self.scoring.finish(core::iter::once(estimates).chain(truths).chain(further)))
     }
 }
 

@@ -144,7 +144,7 @@ fn run(board: &mut Board) -> Option<()> {
         let of_follower = black_box(measurement(tick, &follower, &applied, 0b111));
         measuring.time(counts, || ());
         observing.time(counts, || observer.step(&of_leader, &mut estimate));
-        controlling.time(counts, || controller.step(&estimate, &of_follower, &mut command));
+        controlling.time(counts, || controller.step(&estimate, None, &of_follower, &mut command));
         leader = body.flow(&leader, &Vector3::zeros(), TICK_S);
         follower = moving.time(counts, || body.flow(&follower, &applied, TICK_S));
     }

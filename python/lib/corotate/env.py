@@ -32,8 +32,8 @@ def _bounds(limits):
 class Env(gymnasium.Env):
     """A scenario in one thread. The bits are those of a run with the same commands and the same seed.
 
-    An observation has every number of the estimate, then of each driven body's measurement, then the reference, if there is one
-    (`observation_names`), bounded by what the guards accept; a number stays where its sample is missing. An action is the first field of
+    An observation has every number of the estimate, then of each driven body's measurement, then of their own estimates, then the reference,
+    if there is one (`observation_names`), bounded by what the guards accept; a number stays where its sample is missing. An action is the first field of
     each command (`action_names`), bounded by `action_bound` or else by what the command guard accepts; with `normalize_actions` it is
     from -1 to 1 of that. The reward is minus the scenario's first metric.
 

@@ -17,8 +17,10 @@ pub struct LawInputs<'a, L: Law + ?Sized> {
     pub period_s: f64,
     /// The reference at this tick: the numbers of the rig's reference fields, in their order and units. Empty without them.
     pub reference: &'a [f64],
-    /// The estimate of the observed body's state.
+    /// The estimate of the first body's state.
     pub estimate: &'a L::Estimate,
+    /// The estimate of the driven body's own state; `None` if the body has no observer.
+    pub own_estimate: Option<&'a L::Estimate>,
     /// The driven body's own measurement.
     pub measurement: &'a L::Measurement,
 }
@@ -32,7 +34,7 @@ impl<L: Law + ?Sized> LawInputs<'_, L> {
 
 /// The control law of one rig for one driven body.
 pub trait Law {
-    /// The estimate of the observed body's state.
+    /// The estimate of a body's state.
     type Estimate: Sample;
     /// The driven body's measurement.
     type Measurement: Message + ?Sized;
@@ -94,15 +96,23 @@ impl<L: Law> Controller<L> {
         own.zip(values).for_each(|(own, value)| *own = *value);
     }
 
-    /// Computes command k from estimate k and measurement k. The caller sets the stamp's `generation` and `sent_ns`.
+    /// Computes command k from the estimates and the measurement of tick k. `own_estimate` is that of the driven body, if it has an
+    /// observer. The caller sets the stamp's `generation` and `sent_ns`.
     ///
     /// The command's origin is that of the estimate: the observed body's measurement.
     #[inline(always)]
-    pub fn step(&mut self, estimate: &L::Estimate, measurement: &L::Measurement, out: &mut L::Command) {
-        debug_assert_eq!(estimate.stamp().tick, measurement.stamp().tick);
+    pub fn step(
+        &mut self,
+        estimate: &L::Estimate,
+        own_estimate: Option<&L::Estimate>,
+        measurement: &L::Measurement,
+        out: &mut L::Command,
+    ) {
         let tick = estimate.stamp().tick;
-        let reference = &self.reference[..self.referred];
-        self.law.command(&LawInputs { tick, period_s: self.period_s, reference, estimate, measurement }, out);
+        debug_assert_eq!(tick, measurement.stamp().tick);
+        debug_assert!(own_estimate.is_none_or(|own| own.stamp().tick == tick));
+        let (period_s, reference) = (self.period_s, &self.reference[..self.referred]);
+        self.law.command(&LawInputs { tick, period_s, reference, estimate, own_estimate, measurement }, out);
         out.stamp_mut().answer(estimate.stamp());
     }
 }

@@ -6,8 +6,8 @@
 use super::{CommandEvent, Controller, Estimator, Law, Observer, Plant, SingleBody};
 use crate::sample::{Message, Stamp};
 
-/// A body with its newest samples, and its controller if it is driven.
-pub struct LoopBody<B: SingleBody, L: Law, C> {
+/// A body with its newest samples, its controller if it is driven, and its observer unless it is the first body.
+pub struct LoopBody<B: SingleBody, E: Estimator, L: Law, C> {
     /// The body with its actuators.
     pub plant: Plant<B>,
     /// Its newest measurement.
@@ -16,12 +16,20 @@ pub struct LoopBody<B: SingleBody, L: Law, C> {
     pub truth: B::Truth,
     /// The controller with its commands; `None` if the body is free.
     pub control: Option<LoopControl<L, C>>,
+    /// The observer of this body; `None` for the first body, whose observer is that of the loop, and for one without observer.
+    pub observed: Option<LoopObserver<E>>,
 }
 
-impl<B: SingleBody, L: Law<Command = B::Command>, C: AsMut<[B::Command]>> LoopBody<B, L, C> {
+impl<B: SingleBody, E: Estimator, L: Law<Command = B::Command>, C: AsMut<[B::Command]>> LoopBody<B, E, L, C> {
     /// Creates a body before its first tick.
     pub fn new(plant: Plant<B>, control: Option<LoopControl<L, C>>) -> Self {
-        Self { plant, measurement: Default::default(), truth: Default::default(), control }
+        Self { plant, measurement: Default::default(), truth: Default::default(), control, observed: None }
+    }
+
+    /// Adds an observer of this body, which is not the first.
+    #[must_use]
+    pub fn observed(self, observer: Option<Observer<E>>) -> Self {
+        Self { observed: observer.map(|observer| LoopObserver { observer, estimate: Default::default() }), ..self }
     }
 
     /// Measures, tells the state and moves for a tick.
@@ -41,6 +49,14 @@ pub struct LoopControl<L, C> {
     pub commands: C,
 }
 
+/// An observer with its newest estimate.
+pub struct LoopObserver<E: Estimator> {
+    /// The observer.
+    pub observer: Observer<E>,
+    /// Its newest estimate.
+    pub estimate: E::Estimate,
+}
+
 /// Returns the index of a tick's command among `delay_ticks` commands. It is also that of the command that acts from this tick on,
 /// until the tick's own command replaces it.
 #[inline]
@@ -51,12 +67,14 @@ pub fn command_index(tick: u64, delay_ticks: usize) -> usize {
 
 /// Runs one tick: every body measures and moves, the observer reads the first one, each controller commands its body, and the
 /// commands that are due act from the next tick on. Returns false if a command that is due does not act.
+///
+/// `FURTHER` is true if bodies other than the first may have observers: a loop without them pays nothing for the question.
 #[inline]
-pub fn cycle<B, E, L, C>(
+pub fn cycle<const FURTHER: bool, B, E, L, C>(
     stamp: &Stamp,
     observer: &mut Observer<E>,
     estimate: &mut E::Estimate,
-    bodies: &mut [LoopBody<B, L, C>],
+    bodies: &mut [LoopBody<B, E, L, C>],
 ) -> bool
 where
     B: SingleBody,
@@ -65,16 +83,16 @@ where
     C: AsMut<[B::Command]>,
 {
     bodies.iter_mut().for_each(|body| body.turn(stamp));
-    respond(stamp, observer, estimate, bodies)
+    respond::<FURTHER, _, _, _, _>(stamp, observer, estimate, bodies)
 }
 
-/// Runs the part of a tick after the bodies' turns: observer and controllers. Returns false if a command that is due does not act.
+/// Runs the part of a tick after the bodies' turns: observers and controllers. Returns false if a command that is due does not act.
 #[inline]
-pub fn respond<B, E, L, C>(
+pub fn respond<const FURTHER: bool, B, E, L, C>(
     stamp: &Stamp,
     observer: &mut Observer<E>,
     estimate: &mut E::Estimate,
-    bodies: &mut [LoopBody<B, L, C>],
+    bodies: &mut [LoopBody<B, E, L, C>],
 ) -> bool
 where
     B: SingleBody,
@@ -83,14 +101,14 @@ where
     C: AsMut<[B::Command]>,
 {
     let Some(observed) = bodies.first() else { return true };
-    if observer.is_due(stamp.tick) {
-        observer.step(&observed.measurement, estimate);
-    } else {
-        estimate.stamp_mut().answer(observed.measurement.stamp());
-    }
-    estimate.stamp_mut().generation = stamp.generation;
+    observe(stamp, observer, &observed.measurement, estimate);
     let mut all_act = true;
-    for LoopBody { plant, measurement, control, .. } in bodies {
+    for (index, LoopBody { plant, measurement, control, observed, .. }) in bodies.iter_mut().enumerate() {
+        let mut own_estimate = (index == 0).then_some(&*estimate);
+        if FURTHER && let Some(LoopObserver { observer, estimate }) = observed {
+            observe(stamp, observer, measurement, estimate);
+            own_estimate = Some(estimate);
+        }
         let Some(LoopControl { controller, commands }) = control else { continue };
         let (commands, next) = (commands.as_mut(), stamp.tick + 1);
         let delay_ticks = commands.len();
@@ -99,7 +117,7 @@ where
         }
         let command = &mut commands[command_index(stamp.tick, delay_ticks)];
         if controller.is_due(stamp.tick) {
-            controller.step(estimate, measurement, command);
+            controller.step(estimate, own_estimate, measurement, command);
         } else {
             command.stamp_mut().answer(estimate.stamp());
         }
@@ -108,6 +126,22 @@ where
         all_act &= plant.command(next, Some(&commands[command_index(next, delay_ticks)])) == expected;
     }
     all_act
+}
+
+/// Computes an estimate from the measurement of the same tick, or sends the last one again.
+#[inline(always)]
+fn observe<E: Estimator>(
+    stamp: &Stamp,
+    observer: &mut Observer<E>,
+    measurement: &E::Measurement,
+    out: &mut E::Estimate,
+) {
+    if observer.is_due(stamp.tick) {
+        observer.step(measurement, out);
+    } else {
+        out.stamp_mut().answer(measurement.stamp());
+    }
+    out.stamp_mut().generation = stamp.generation;
 }
 
 /// Copies the command of the tick before this one.

@@ -13,7 +13,7 @@ mod relation;
 
 pub use actuated::{Actuated, Dynamics};
 pub use controller::{Controller, Law, LawInputs, REFERENCE_MAX};
-pub use cycle::{LoopBody, LoopControl, command_index, cycle, respond};
+pub use cycle::{LoopBody, LoopControl, LoopObserver, command_index, cycle, respond};
 pub use guard::{AcceptAll, Bounds, Guard, MotionCheck, PlausibilityCheck, Refusal, SUSPECT_SAMPLES};
 pub use observer::{Estimator, Observer};
 pub use plant::{Actuation, Body, CommandEvent, Plant, Rearm, SingleBody};

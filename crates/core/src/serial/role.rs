@@ -186,7 +186,7 @@ impl<B: SingleBody> DeviceRole for DevicePlant<B> {
     }
 }
 
-/// The role of an observer of the first body.
+/// The role of an observer of one body.
 pub struct DeviceObserver<E: Estimator> {
     observer: Observer<E>,
 }
@@ -227,21 +227,30 @@ impl<E: Estimator> DeviceRole for DeviceObserver<E> {
 /// The role of a controller of N driven bodies.
 pub struct DeviceController<L: Law, const N: usize> {
     controllers: [Controller<L>; N],
+    drives_first: bool,
 }
 
 impl<L: Law<Measurement: Sample, Command: Sample>, const N: usize> DeviceController<L, N> {
     /// Creates a controller with the law of each body and the period of the greeting. It has no reference.
     pub fn new(laws: [L; N], hello: &Hello<'_>) -> Self {
-        Self { controllers: laws.map(|law| Controller::new(law, hello.period_ns as f64 / 1e9)) }
+        let controllers = laws.map(|law| Controller::new(law, hello.period_ns as f64 / 1e9));
+        Self { controllers, drives_first: false }
+    }
+
+    /// States that the first law drives the first body of the scenario: the estimate is that of its own body.
+    #[must_use]
+    pub fn driving_first(self) -> Self {
+        Self { drives_first: true, ..self }
     }
 
     /// Computes one command for each body whose measurement is present.
     fn command(&mut self, tick: u64, estimate: Option<&L::Estimate>, inputs: &mut Inputs<'_>, outputs: &mut Outputs) {
-        for controller in &mut self.controllers {
+        for (index, controller) in self.controllers.iter_mut().enumerate() {
+            let own_estimate = estimate.filter(|_| self.drives_first && index == 0);
             let measurement = inputs.take::<L::Measurement>(tick);
             let command = estimate.zip(measurement).map(|(estimate, measurement)| {
                 let mut command = L::Command::default();
-                controller.step(estimate, &measurement, &mut command);
+                controller.step(estimate, own_estimate, &measurement, &mut command);
                 command
             });
             outputs.put(command.as_ref());
@@ -280,6 +289,12 @@ where
     /// Creates both roles at their initial states, with the period of the greeting.
     pub fn new(estimator: E, laws: [L; N], hello: &Hello<'_>) -> Self {
         Self { observer: DeviceObserver::new(estimator, hello), controller: DeviceController::new(laws, hello) }
+    }
+
+    /// As [`DeviceController::driving_first`].
+    #[must_use]
+    pub fn driving_first(self) -> Self {
+        Self { controller: self.controller.driving_first(), ..self }
     }
 }
 

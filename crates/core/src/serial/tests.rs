@@ -2,8 +2,8 @@
 //! mismatches.
 
 use super::*;
-use crate::role::{Actuation, Body, CommandEvent, Plant, Rearm};
-use crate::sample::{RateCommand, RateMeasurement, RateTruth, Sample, Stamp, content_length};
+use crate::role::{Actuation, Body, CommandEvent, Law, LawInputs, Plant, Rearm};
+use crate::sample::{RateCommand, RateEstimate, RateMeasurement, RateTruth, Sample, Stamp, content_length};
 use proptest::prelude::*;
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::{Rng, SeedableRng};
@@ -474,6 +474,34 @@ fn mismatched_samples_and_roles_are_refused() {
     assert!(matches!(rig.until(PERIOD_NS), Some(Event::Refused(Reason::Role, _))));
     let mut rig = Rig::new(Hello { timeout_ticks: 0, ..hello(1, true) }, CLEAN, 1);
     assert!(matches!(rig.until(PERIOD_NS), Some(Event::Refused(Reason::Role, _))));
+}
+
+/// A law that commands 1 if it has an own estimate.
+struct Aware;
+
+impl Law for Aware {
+    type Estimate = RateEstimate;
+    type Measurement = RateMeasurement;
+    type Command = RateCommand;
+
+    fn command(&mut self, inputs: &LawInputs<'_, Self>, out: &mut RateCommand) {
+        out.acceleration_rad_s2[0] = f64::from(u8::from(inputs.own_estimate.is_some()));
+    }
+}
+
+#[test]
+fn the_first_law_has_an_own_estimate_if_it_drives_the_first_body() {
+    let controller = || DeviceController::new([Aware, Aware], &hello(1, true));
+    let bytes = vec![0; content_length::<RateEstimate>() + 2 * content_length::<RateMeasurement>()];
+    for (mut device, expected) in [(controller(), [0.0, 0.0]), (controller().driving_first(), [1.0, 0.0])] {
+        let read = Samples { present: 0b111, bytes: &bytes };
+        let (mut inputs, mut outputs) =
+            (Inputs::new(read, DeviceController::<Aware, 2>::reads()).unwrap(), Outputs::default());
+        device.execute(7, &mut inputs, &mut outputs);
+        let mut written = Inputs::new(outputs.samples(), DeviceController::<Aware, 2>::writes()).unwrap();
+        let commands = [(); 2].map(|()| written.take::<RateCommand>(7).unwrap().acceleration_rad_s2[0]);
+        assert_eq!(commands, expected);
+    }
 }
 
 /// Returns the bytes of a Stop of another version.

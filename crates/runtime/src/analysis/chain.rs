@@ -5,7 +5,8 @@
 use crate::config::{Rates, Settings};
 use crate::rig::{Command, Estimate, Measurement, Rig, RigLoopBody, Truth, loop_body, observer};
 use crate::role::{
-    Actuation, Guard, LoopBody, LoopControl, Observer, Rearm, SUSPECT_SAMPLES, command_index, cycle, respond,
+    Actuation, Guard, LoopBody, LoopControl, LoopObserver, Observer, Rearm, SUSPECT_SAMPLES, command_index, cycle,
+    respond,
 };
 use crate::sample::{Field, FieldKind, Message, Sample, Stamp};
 use crate::state::{Persist, Words, each_number};
@@ -57,7 +58,7 @@ impl<R: Rig> Chain<R> {
     /// Runs one tick.
     pub fn advance(&mut self) {
         let stamp = Stamp { tick: self.tick, generation: 1, ..Stamp::default() };
-        cycle(&stamp, &mut self.observer, &mut self.estimate, &mut self.bodies);
+        cycle::<true, _, _, _, _>(&stamp, &mut self.observer, &mut self.estimate, &mut self.bodies);
         self.tick += 1;
     }
 
@@ -77,7 +78,7 @@ impl<R: Rig> Chain<R> {
                 }
             }
         }
-        respond(&stamp, &mut self.observer, &mut self.estimate, &mut self.bodies);
+        respond::<true, _, _, _, _>(&stamp, &mut self.observer, &mut self.estimate, &mut self.bodies);
         self.tick += 1;
     }
 
@@ -104,7 +105,15 @@ impl<R: Rig> Chain<R> {
     /// Computes the rig's metrics at the last tick, in the rig's order.
     pub fn score(&self, out: &mut [f64]) {
         let truth = |index: usize| Some(&self.bodies.get(index)?.truth);
-        self.rig.score(truth, |_| None, Some(&self.estimate), &self.reference, out);
+        self.rig.score(truth, |_| None, |index| self.estimate_of(index), &self.reference, out);
+    }
+
+    /// Returns the estimate of a body at the last tick, if the body has an observer.
+    fn estimate_of(&self, index: usize) -> Option<&Estimate<R>> {
+        match index {
+            0 => Some(&self.estimate),
+            _ => Some(&self.bodies.get(index)?.observed.as_ref()?.estimate),
+        }
     }
 
     /// Returns the first body whose motion has ended, with the reason.
@@ -140,11 +149,15 @@ impl<R: Rig> Chain<R> {
 
     /// Passes the state of the loop, without that of the motion to follow.
     fn state<W: Words>(&mut self, visitor: &mut W) {
-        let LoopBody { plant, control, .. } = &mut self.bodies[self.own];
+        let LoopBody { plant, control, observed, .. } = &mut self.bodies[self.own];
         plant.persist(visitor);
-        self.observer.persist(visitor);
-        if self.rates.observer_ticks > 1 {
-            pass_numbers(&mut self.estimate, visitor);
+        let first = (&mut self.observer, &mut self.estimate);
+        let own = observed.as_mut().map(|LoopObserver { observer, estimate }| (observer, estimate));
+        for (observer, estimate) in [first].into_iter().chain(own) {
+            observer.persist(visitor);
+            if self.rates.observer_ticks > 1 {
+                pass_numbers(estimate, visitor);
+            }
         }
         let Some(LoopControl { controller, commands }) = control else { return };
         controller.persist(visitor);

@@ -22,7 +22,8 @@ impl<R: Rig> Analysis<'_, R> {
         }
     }
 
-    /// Runs the loop as it is, from the scenario's start, and returns the largest value of every metric in the last quarter.
+    /// Runs the loop as it is, from the scenario's start, and returns the largest value of every metric in the last quarter; NaN for a
+    /// metric without a value, whose body has no observer.
     ///
     /// # Errors
     /// The reason why the loop is not settled by then.
@@ -37,11 +38,19 @@ impl<R: Rig> Analysis<'_, R> {
             if let Some(loss) = chain.loss() {
                 return Err(format!("the loop fails: {loss} after {} s", digits(tick as f64 * self.tick_s)));
             }
-            if values.iter().any(|value| !value.is_finite()) {
+            if tick == 0 {
+                floors
+                    .iter_mut()
+                    .zip(&values)
+                    .filter(|(_, value)| value.is_nan())
+                    .for_each(|(floor, _)| *floor = f64::NAN);
+            }
+            if values.iter().zip(&floors).any(|(value, floor)| !value.is_finite() && !floor.is_nan()) {
                 return Err("from this start the loop diverges".to_owned());
             }
             if tick >= ticks - ticks.div_ceil(4) {
-                floors.iter_mut().zip(&values).for_each(|(floor, value)| *floor = value.max(*floor));
+                let valued = floors.iter_mut().zip(&values).filter(|(floor, _)| !floor.is_nan());
+                valued.for_each(|(floor, value)| *floor = value.max(*floor));
             }
         }
         let limits = &self.scenario.accept.metric_max;

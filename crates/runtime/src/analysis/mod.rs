@@ -127,7 +127,7 @@ impl<R: Rig> Analysis<'_, R> {
             continuous_rate_per_s: certificate.and_then(|certificate| certificate.continuous_rate_per_s),
             loop_rate_per_s,
             over_s: loop_rate_per_s.map(|rate| self.ticks_to_settle(rate) as f64 * self.tick_s),
-            floor: floors.first().copied(),
+            floor: floors.first().copied().filter(|floor| !floor.is_nan()),
             reaches: loop_rate_per_s.map_or(Vec::new(), |rate| self.reaches(rate, &floors)),
             floors: self.named(&floors),
             conditions: certificate.map_or(Vec::new(), |certificate| certificate.conditions.clone()),
@@ -140,7 +140,8 @@ impl<R: Rig> Analysis<'_, R> {
     }
 
     fn named(&self, values: &[f64]) -> Vec<Figure> {
-        let named = self.rig.metrics().into_iter().zip(values);
+        // A metric of an estimate has no value if its body has no observer.
+        let named = self.rig.metrics().into_iter().zip(values).filter(|(_, value)| !value.is_nan());
         named.map(|(name, value)| Figure { name: name.to_owned(), value: *value }).collect()
     }
 
@@ -156,7 +157,7 @@ impl<R: Rig> Analysis<'_, R> {
         let limits = &self.scenario.accept.metric_max;
         let limited = self.rig.metrics().into_iter().zip(start.iter().zip(floors));
         let reach = |(metric, (from, floor)): (&str, (&f64, &f64))| {
-            let limit = *limits.get(metric)?;
+            let limit = *limits.get(metric).filter(|_| !floor.is_nan())?;
             let after_s = (limit > *floor).then(|| ((from / limit).ln() / rate_per_s).max(0.0));
             Some(Reach { metric: metric.to_owned(), limit, from: *from, after_s })
         };

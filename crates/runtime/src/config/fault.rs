@@ -160,8 +160,8 @@ impl FaultCheck<'_, '_, '_> {
         self.require(raw.body.is_none(), "body", "unused-key", || {
             "is for the controller, which sends a command to each driven body; remove it".to_owned()
         })?;
-        let body = if raw.role == "observer" { &*bodies[0].name } else { &*raw.role };
-        Some(vec![Some(body.to_owned())])
+        let observed = bodies.iter().find(|body| body.observer.as_ref() == Some(&raw.role));
+        Some(vec![Some(observed.map_or(raw.role.clone(), |body| body.name.to_string()))])
     }
 
     /// Returns the fault's action on the samples about this body, or on the role itself.
@@ -189,9 +189,10 @@ impl FaultCheck<'_, '_, '_> {
 
     /// Returns the fields of the signal that the role sends about a body.
     fn fields(&self, body: &str) -> Option<Fields> {
+        let observes = |body: &BodyInfo| body.observer.as_ref() == Some(&self.raw.role);
         let signal = match &*self.raw.role {
-            "observer" => Signal::Estimate,
             "controller" => Signal::Command,
+            _ if self.setting.bodies.iter().any(observes) => Signal::Estimate,
             _ => Signal::Measurement,
         };
         let port = self.setting.signals.iter().find(|port| port.topic.body == body && port.topic.signal == signal)?;

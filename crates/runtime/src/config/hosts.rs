@@ -2,6 +2,7 @@
 //!
 //! Must not know the transport between hosts.
 
+use super::body::{BodyInfo, role_names};
 use super::checks::Checks;
 use serde::{Deserialize, Serialize};
 
@@ -104,25 +105,31 @@ impl Hosts {
         budgets.min().unwrap_or(self.network.budget_ticks)
     }
 
+    /// Returns the observer of a body, and the delay budget from the body to it, ticks; `None` without observer.
+    fn estimated<'a>(&self, body: &'a BodyInfo) -> Option<(&'a str, u64)> {
+        let observer = body.observer.as_deref()?;
+        Some((observer, self.role_budget(&body.name, observer)))
+    }
+
     /// Returns the ticks after its own tick during which a role may still wait for inputs: the sum of the budgets from the
-    /// measurements to it, 0 if no input crosses hosts. `bodies` holds each body's name and true if it is driven; the first one is
-    /// observed.
-    pub fn lag_ticks<'a>(&self, role: &str, bodies: impl Iterator<Item = (&'a str, bool)> + Clone) -> u64 {
-        let Some((leader, _)) = bodies.clone().next() else { return 0 };
-        let estimated = self.role_budget(leader, "observer");
-        match role {
-            "observer" => estimated,
-            "controller" => {
-                let driven = bodies.filter(|(_, driven)| *driven).map(|(body, _)| self.role_budget(body, "controller"));
-                driven.max().unwrap_or(0).max(estimated + self.role_budget("observer", "controller"))
-            }
-            _ => 0,
+    /// measurements to it, 0 if no input crosses hosts.
+    pub fn lag_ticks(&self, role: &str, bodies: &[BodyInfo]) -> u64 {
+        if role != "controller" {
+            let observer =
+                bodies.iter().filter_map(|body| self.estimated(body)).find(|(observer, _)| *observer == role);
+            return observer.map_or(0, |(_, ticks)| ticks);
         }
+        let driven = bodies.iter().filter(|body| body.driven).map(|body| self.role_budget(&body.name, role));
+        let read = bodies.iter().enumerate().filter(|(index, body)| *index == 0 || body.driven);
+        let estimates = read.filter_map(|(_, body)| self.estimated(body));
+        let estimates = estimates.map(|(observer, ticks)| ticks + self.role_budget(observer, role));
+        driven.chain(estimates).max().unwrap_or(0)
     }
 }
 
 /// Checks that every role has one host, and that the budgets fit into the delay of the actuators.
-pub(crate) fn check(hosts: &Hosts, bodies: &[(&str, bool)], roles: &[&str], delay_ticks: u64, checks: &mut Checks<'_>) {
+pub(crate) fn check(hosts: &Hosts, bodies: &[BodyInfo], delay_ticks: u64, checks: &mut Checks<'_>) {
+    let roles = role_names(bodies);
     let mut taken: Vec<&str> = Vec::new();
     for (index, host) in hosts.hosts.iter().enumerate() {
         let key = |part: &str| format!("host[{index}].{part}");
@@ -144,8 +151,8 @@ pub(crate) fn check(hosts: &Hosts, bodies: &[(&str, bool)], roles: &[&str], dela
     checks.require(hosts.hosts.is_empty() || unassigned.is_empty(), "host", "role-without-host", || {
         format!("no host has the role {}; name every role once", unassigned.join(", "))
     });
-    let lag = hosts.lag_ticks("controller", bodies.iter().copied());
-    for (body, _) in bodies.iter().filter(|(_, driven)| *driven) {
+    let lag = hosts.lag_ticks("controller", bodies);
+    for BodyInfo { name: body, .. } in bodies.iter().filter(|body| body.driven) {
         let needed = lag + hosts.role_budget("controller", body);
         checks.require(needed <= delay_ticks, "actuation_delay_ticks", "budget-too-long", || {
             format!(
@@ -222,7 +229,11 @@ mod tests {
     use crate::config::SHIPPED;
     use crate::scenario::Scenario;
 
-    const BODIES: [(&str, bool); 2] = [("leader", false), ("follower", true)];
+    fn bodies(observers: [Option<&str>; 2]) -> [BodyInfo; 2] {
+        let [leader, follower] = observers.map(|observer| observer.map(str::to_owned));
+        let leader = BodyInfo { observer: leader, ..BodyInfo::free("leader") };
+        [leader, BodyInfo { observer: follower, ..BodyInfo::driven("follower") }]
+    }
 
     fn hosts(hosts: &[(&str, &[&str])]) -> Hosts {
         let host = |(name, roles): &(&str, &[&str])| Host {
@@ -234,7 +245,7 @@ mod tests {
 
     #[test]
     fn budgets_add_up_on_the_way_to_a_role() {
-        let lag = |hosts: &Hosts, role: &str| hosts.lag_ticks(role, BODIES.into_iter());
+        let lag = |hosts: &Hosts, role: &str| hosts.lag_ticks(role, &bodies([Some("observer"), None]));
         let bench = hosts(&[("bench", &["leader", "follower"]), ("flight", &["observer", "controller"])]);
         assert_eq!([lag(&bench, "observer"), lag(&bench, "controller"), lag(&bench, "follower")], [3, 3, 0]);
         let three = hosts(&[("a", &["leader", "follower"]), ("b", &["observer"]), ("c", &["controller"])]);
@@ -242,6 +253,10 @@ mod tests {
         let formation = hosts(&[("one", &["leader", "observer", "controller"]), ("two", &["follower"])]);
         assert_eq!([lag(&formation, "observer"), lag(&formation, "controller")], [0, 3]);
         assert_eq!(lag(&Hosts::default(), "controller"), 0, "one computer");
+        let both = bodies([Some("observer"), Some("observer-follower")]);
+        let apart = hosts(&[("a", &["leader", "follower", "observer", "controller"]), ("b", &["observer-follower"])]);
+        assert_eq!([apart.lag_ticks("observer-follower", &both), apart.lag_ticks("controller", &both)], [3, 6]);
+        assert_eq!(apart.lag_ticks("observer", &both), 0);
         let link = |from: &str, to: &str, budget_ticks| LinkBudget { from: from.into(), to: to.into(), budget_ticks };
         let network = Network { link: vec![link("a", "b", 1), link("c", "a", 9)], ..three.network.clone() };
         let three = Hosts { network, ..three };

@@ -79,7 +79,7 @@ pub enum InputUser {
     Body(usize),
     /// The actuators of the body with this index.
     Actuator(usize),
-    /// The observer.
+    /// The observers of all observed bodies.
     Observer,
     /// The law of the body with this index.
     Law(usize),

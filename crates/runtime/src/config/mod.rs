@@ -22,6 +22,7 @@ mod shape;
 pub(crate) mod watchdog;
 
 pub use accept::{Accept, TickAmount, TickLimit};
+pub(crate) use body::observe;
 pub use body::{BodyInfo, role_names};
 pub use checks::Checks;
 pub use document::{Document, read_text};

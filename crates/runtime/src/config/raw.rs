@@ -26,6 +26,8 @@ pub(crate) struct Raw {
     pub actuation_delay_ticks: u64,
     #[serde(default = "one_step", skip_serializing_if = "is_one")]
     pub substeps: u64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub observed: Option<Vec<String>>,
     #[serde(default)]
     pub record: bool,
     #[serde(default)]

@@ -68,7 +68,7 @@ pub struct Settings {
     pub accept: Accept,
     /// The run to which this scenario belongs, if any. Each new run gets a new identifier.
     pub run: Option<RunId>,
-    /// The bodies of the rig; the first is the observed one.
+    /// The bodies of the rig with their observers; the first is always observed.
     pub bodies: Vec<BodyInfo>,
     /// The signals of the bodies.
     pub signals: Vec<Port>,
@@ -103,7 +103,7 @@ impl Settings {
 
     /// Returns the ticks after its own tick during which a role may still wait for inputs that cross hosts.
     pub fn lag_ticks(&self, role: &str) -> u64 {
-        self.hosts.lag_ticks(role, self.bodies.iter().map(|body| (&*body.name, body.driven)))
+        self.hosts.lag_ticks(role, &self.bodies)
     }
 
     /// Returns the longest silence of another host, s. A starting host is loaded, and its session may have to be replaced, so it

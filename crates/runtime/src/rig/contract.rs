@@ -23,7 +23,8 @@ pub type Estimate<R> = <<R as Rig>::Estimator as Estimator>::Estimate;
 pub type Command<R> = <<R as Rig>::Body as Body>::Command;
 
 /// A body of a rig's loop in one thread.
-pub type RigLoopBody<R> = LoopBody<SensedBody<<R as Rig>::Body>, <R as Rig>::Law, Vec<Command<R>>>;
+pub type RigLoopBody<R> =
+    LoopBody<SensedBody<<R as Rig>::Body>, <R as Rig>::Estimator, <R as Rig>::Law, Vec<Command<R>>>;
 
 /// Creates a body of a loop in one thread, at its initial state; `controlled` adds its controller.
 pub fn loop_body<R: Rig>(
@@ -37,7 +38,8 @@ pub fn loop_body<R: Rig>(
         controller: controller(rig.law(index), settings),
         commands: vec![Command::<R>::default(); actuation.delay_ticks as usize],
     });
-    LoopBody::new(plant(sensed_body(rig, index, settings), actuation, settings), control)
+    let plant = plant(sensed_body(rig, index, settings), actuation, settings);
+    LoopBody::new(plant, control).observed(further_observer(rig, index, settings))
 }
 
 /// Creates a single body with its sensors, at its initial state.
@@ -50,9 +52,23 @@ pub fn plant<B: Body>(body: B, actuation: Actuation, settings: &Settings) -> Pla
     Plant::new(body, actuation, settings.tick_s()).with_substeps(settings.rates.substeps)
 }
 
-/// Creates the observer of a rig at its initial guess.
+/// Creates the observer of a rig's first body at its initial guess.
 pub fn observer<R: Rig>(rig: &R, settings: &Settings) -> Observer<R::Estimator> {
-    Observer::new(rig.estimator(), settings.tick_s()).every(settings.rates.observer_ticks)
+    observing(rig.estimator(), settings)
+}
+
+/// Creates the observer of the body with this index, which is not the first, at its initial guess. Returns `None` if the scenario has
+/// none.
+pub fn further_observer<R: Rig>(rig: &R, index: usize, settings: &Settings) -> Option<Observer<R::Estimator>> {
+    let name = &rig.bodies()[index].name;
+    // An isolated rig has fewer bodies than the scenario.
+    let observed = settings.bodies.iter().any(|body| body.name == *name && body.observer.is_some());
+    let estimator = rig.estimator_of(index).filter(|_| index > 0 && observed);
+    estimator.map(|estimator| observing(estimator, settings))
+}
+
+fn observing<E: Estimator>(estimator: E, settings: &Settings) -> Observer<E> {
+    Observer::new(estimator, settings.tick_s()).every(settings.rates.observer_ticks)
 }
 
 /// Creates the controller of a law with the scenario's reference at tick 0.
@@ -84,7 +100,7 @@ pub enum Start {
 
 /// A plant, an observer and a control law that belong together.
 ///
-/// Body 0 is the observed one, usually the leader; the driven bodies follow it. Most rigs need only
+/// Body 0 is always observed, usually it is the leader; the driven bodies follow it. Most rigs need only
 /// [`SimpleRig`](super::SimpleRig), which implements this trait. Implement `Rig` itself for fleets, guards of your own, several
 /// rig names, certificates or Lyapunov functions.
 ///
@@ -92,7 +108,7 @@ pub enum Start {
 pub trait Rig: Clone + Send + Sync + 'static {
     /// The plant: a body with its sensors and actuators.
     type Body: SingleBody + Persist;
-    /// The observer of body 0.
+    /// The observer of a body.
     type Estimator: Estimator<Measurement = Measurement<Self>> + Persist;
     /// The control law of a driven body.
     type Law: Law<Estimate = Estimate<Self>, Measurement = Measurement<Self>, Command = Command<Self>> + Persist;
@@ -131,17 +147,22 @@ pub trait Rig: Clone + Send + Sync + 'static {
         context: Context,
         checks: &mut Checks<'_>,
     ) -> Result<(Option<Self>, toml::Table), ConfigError>;
-    /// Returns the bodies; the first is the observed one.
+    /// Returns the bodies; the first is always observed.
     fn bodies(&self) -> &[BodyInfo];
     /// Creates a body at its initial state.
     fn body(&self, index: usize) -> Self::Body;
-    /// Creates the observer at its initial guess.
+    /// Creates the observer of the first body at its initial guess.
     fn estimator(&self) -> Self::Estimator;
+    /// Creates the observer of the body with this index at its initial guess; `None` if a scenario cannot let this body be observed. By
+    /// default only the first body can.
+    fn estimator_of(&self, index: usize) -> Option<Self::Estimator> {
+        (index == 0).then(|| self.estimator())
+    }
     /// Creates the law of a driven body.
     fn law(&self, index: usize) -> Self::Law;
     /// Creates a reader's guard for a body's measurements. `acts` is true for a reader that controls with them.
     fn measurement_guard(&self, index: usize, acts: bool) -> Self::MeasurementGuard;
-    /// Creates a reader's guard for estimates.
+    /// Creates a reader's guard for the estimates of any body.
     fn estimate_guard(&self) -> Self::EstimateGuard;
     /// Creates a guard for a body's commands.
     fn command_guard(&self, index: usize) -> Self::CommandGuard;
@@ -165,12 +186,12 @@ pub trait Rig: Clone + Send + Sync + 'static {
         Vec::new()
     }
     /// Writes one tick's value of every metric: NaN if a sample that it needs is missing, +inf once a body is lost. `truth` returns
-    /// the truth of the body with an index, `fleet` that of a fleet. `reference` has the numbers of the reference at that tick.
+    /// the truth of the body with an index, `fleet` that of a fleet, `estimate` the estimate of a body. `reference` has the numbers of the reference at that tick.
     fn score<'a>(
         &self,
         truth: impl Fn(usize) -> Option<&'a Truth<Self>>,
         fleet: impl Fn(usize) -> Option<&'a FleetTruth<Self>>,
-        estimate: Option<&Estimate<Self>>,
+        estimate: impl Fn(usize) -> Option<&'a Estimate<Self>>,
         reference: &[f64],
         out: &mut [f64],
     );

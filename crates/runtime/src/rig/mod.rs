@@ -17,7 +17,8 @@ mod words;
 pub use crate::config::BodyInfo;
 pub use contract::{
     CertificateReport, Command, ConditionReport, Context, Estimate, Figure, FleetCommand, FleetMeasurement, FleetTruth,
-    Measurement, Monitor, Rig, RigLoopBody, Start, Truth, Watched, controller, loop_body, observer, plant, sensed_body,
+    Measurement, Monitor, Rig, RigLoopBody, Start, Truth, Watched, controller, further_observer, loop_body, observer,
+    plant, sensed_body,
 };
 pub use delay::{DelayLine, Due};
 pub use fleet::{Fleet, NoFleet};

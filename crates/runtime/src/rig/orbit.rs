@@ -268,7 +268,7 @@ impl Rig for OrbitRig {
         &self,
         truth: impl Fn(usize) -> Option<&'a OrbitTruth>,
         _fleet: impl Fn(usize) -> Option<&'a FleetTruth<Self>>,
-        estimate: Option<&OrbitEstimate>,
+        estimate: impl Fn(usize) -> Option<&'a OrbitEstimate>,
         _reference: &[f64],
         out: &mut [f64],
     ) {
@@ -282,7 +282,7 @@ impl Rig for OrbitRig {
         let reference = first.map(|leader| self.reference(leader));
         let errors = self.driven().map(|index| errors(state(index), reference));
         let worst = errors.reduce(|a, b| [worse(a[0], b[0]), worse(a[1], b[1])]);
-        let estimated = estimate.map(|estimate| Vector2::from(estimate.velocity_du_s));
+        let estimated = estimate(0).map(|estimate| Vector2::from(estimate.velocity_du_s));
         let estimate_error = match (estimated, first) {
             (Some(estimated), Some(first)) => (estimated - Vector2::new(first.vr, first.vtheta)).norm(),
             _ => f64::NAN,
@@ -445,7 +445,7 @@ mod tests {
             (rig.estimator(), OrbitEstimate::default(), OrbitCommand::default());
         observer.start(&measured(0));
         observer.write(0, &mut estimate);
-        Controller::new(rig.law(index), 0.01).step(&estimate, &measured(index), &mut command);
+        Controller::new(rig.law(index), 0.01).step(&estimate, None, &measured(index), &mut command);
         Vector2::from(command.thrust_du_s2).amax()
     }
 
@@ -473,7 +473,7 @@ mod tests {
     #[test]
     fn a_free_orbit_without_a_follower_is_observed_in_any_unit() {
         let scenario = Scenario::parse(LOW_ORBIT, "test", &[]).unwrap();
-        assert_eq!(scenario.rig.roles(), ["leader", "observer"]);
+        assert_eq!(scenario.roles(), ["leader", "observer"]);
         let rig = scenario.rig.downcast_ref::<OrbitRig>().unwrap();
         assert_eq!((rig.metrics(), rig.certificates().len()), (vec!["estimate_error_du_s"], 0));
         let (mut body, mut observer, mut guard) = (rig.body(0), rig.estimator(), rig.measurement_guard(0, false));
@@ -491,7 +491,7 @@ mod tests {
             body.truth(0, &mut truth);
             observer.write(0, &mut estimate);
             assert!(rig.estimate_guard().accepts(&estimate), "{estimate:?}");
-            rig.score(|_| Some(&truth), |_| None, Some(&estimate), &[], &mut errors);
+            rig.score(|_| Some(&truth), |_| None, |_| Some(&estimate), &[], &mut errors);
             body.flow(rig.tick_s);
         }
         assert!(errors[0] < 1e-6, "an error of {} of 7600 du/s is left", errors[0]);

@@ -122,7 +122,7 @@ use serde::de::DeserializeOwned;
 ///     distance_m_max = 1e-3
 /// "#;
 /// let scenario = Scenario::parse(text, "two-carts.toml", &[])?;
-/// assert_eq!(scenario.rig.roles(), ["leader", "follower", "observer", "controller"]);
+/// assert_eq!(scenario.roles(), ["leader", "follower", "observer", "controller"]);
 /// # Ok::<(), corotate_runtime::config::ConfigError>(())
 /// ```
 ///
@@ -130,7 +130,7 @@ use serde::de::DeserializeOwned;
 pub trait SimpleRig: Serialize + DeserializeOwned + Clone + Send + Sync + 'static {
     /// The plant: a body with its sensors and actuators.
     type Body: SingleBody + Persist;
-    /// The observer of the first body.
+    /// The observer of a body.
     type Estimator: Estimator<Measurement = <Self::Body as Body>::Measurement> + Persist;
     /// The control law of a driven body.
     type Law: Law<
@@ -142,7 +142,7 @@ pub trait SimpleRig: Serialize + DeserializeOwned + Clone + Send + Sync + 'stati
     const NAME: &'static str;
     /// The fields of the type that a scenario gives as lists of tables.
     const LISTS: &'static [&'static str] = &[];
-    /// The bodies, if they do not depend on the scenario; the first is the observed one. By default a free `leader` and a driven
+    /// The bodies, if they do not depend on the scenario; the first is always observed. By default a free `leader` and a driven
     /// `follower`.
     const BODIES: &'static [BodyInfo] = &[BodyInfo::free("leader"), BodyInfo::driven("follower")];
     /// The metrics of a run.
@@ -153,14 +153,19 @@ pub trait SimpleRig: Serialize + DeserializeOwned + Clone + Send + Sync + 'stati
 
     /// Checks the parameters and records problems by key, as `cart.gain_per_s`. May store what it needs of `_context`.
     fn check(&mut self, _context: Context, _checks: &mut Checks<'_>) {}
-    /// Returns the bodies; the first is the observed one. By default [`BODIES`](Self::BODIES).
+    /// Returns the bodies; the first is always observed. By default [`BODIES`](Self::BODIES).
     fn bodies(&self) -> &[BodyInfo] {
         Self::BODIES
     }
     /// Creates the body with this index at its initial state.
     fn body(&self, index: usize) -> Self::Body;
-    /// Creates the observer at its initial guess.
+    /// Creates the observer of the first body at its initial guess.
     fn estimator(&self) -> Self::Estimator;
+    /// Creates the observer of the body with this index at its initial guess, if the scenario's `observed` lists the body. By default
+    /// as that of the first body.
+    fn estimator_of(&self, _index: usize) -> Self::Estimator {
+        self.estimator()
+    }
     /// Creates the law of the driven body with this index.
     fn law(&self, index: usize) -> Self::Law;
     /// Returns the largest permitted magnitude per field name. Guards reject samples beyond it, and samples with NaN or infinity.
@@ -190,19 +195,22 @@ pub trait SimpleRig: Serialize + DeserializeOwned + Clone + Send + Sync + 'stati
 
 /// A metric: the length of the difference between a field and what it is compared with.
 ///
-/// A metric of the driven bodies is that of the worst one. The last part of its name is the unit.
+/// A metric of the driven bodies is that of the worst one, unless it is [for one body](Self::for_body). The last part of its name is the
+/// unit.
 #[derive(Debug, Clone, Copy)]
 pub struct Difference {
     metric: &'static str,
     field: &'static str,
     compared: Compared,
+    /// The name of the only body.
+    body: Option<&'static str>,
 }
 
 #[derive(Debug, Clone, Copy)]
 enum Compared {
     /// The driven bodies with the first body.
     Driven,
-    /// The estimate with the first body.
+    /// The estimate of a body with its truth.
     Estimate,
     /// The driven bodies with the reference.
     Reference,
@@ -213,22 +221,34 @@ enum Compared {
 impl Difference {
     /// Creates a metric of the driven bodies: the distance of their true field from that of the first body.
     pub const fn following(metric: &'static str, field: &'static str) -> Self {
-        Self { metric, field, compared: Compared::Driven }
+        Self { metric, field, compared: Compared::Driven, body: None }
     }
 
-    /// Creates a metric of the estimate: the distance of its field from that of the first body's truth.
+    /// Creates a metric of the first body's estimate: the distance of its field from that of the truth.
     pub const fn estimating(metric: &'static str, field: &'static str) -> Self {
-        Self { metric, field, compared: Compared::Estimate }
+        Self { metric, field, compared: Compared::Estimate, body: None }
     }
 
     /// Creates a metric of the driven bodies: the distance of their true field from the reference, which must have that field.
     pub const fn from_reference(metric: &'static str, field: &'static str) -> Self {
-        Self { metric, field, compared: Compared::Reference }
+        Self { metric, field, compared: Compared::Reference, body: None }
     }
 
     /// Creates a metric of the driven bodies: the length of their true field.
     pub const fn from_zero(metric: &'static str, field: &'static str) -> Self {
-        Self { metric, field, compared: Compared::Zero }
+        Self { metric, field, compared: Compared::Zero, body: None }
+    }
+
+    /// Restricts the metric to one body: instead of the worst driven body, or of the first one's estimate. Without a body of this name
+    /// the metric has no value, and likewise that of an estimate if the body has no observer.
+    ///
+    /// ```
+    /// # use corotate_runtime::rig::Difference;
+    /// const OWN: Difference = Difference::estimating("own_error_m", "position_m").for_body("follower");
+    /// ```
+    #[must_use]
+    pub const fn for_body(self, body: &'static str) -> Self {
+        Self { body: Some(body), ..self }
     }
 
     /// Returns the signal that lacks the metric's field, if there is one. Evaluated at compile time.
@@ -442,6 +462,10 @@ impl<R: SimpleRig> Rig for R {
         SimpleRig::estimator(self)
     }
 
+    fn estimator_of(&self, index: usize) -> Option<Self::Estimator> {
+        Some(SimpleRig::estimator_of(self, index))
+    }
+
     fn law(&self, index: usize) -> Self::Law {
         SimpleRig::law(self, index)
     }
@@ -488,21 +512,26 @@ impl<R: SimpleRig> Rig for R {
         &self,
         truth: impl Fn(usize) -> Option<&'a Truth<Self>>,
         _fleet: impl Fn(usize) -> Option<&'a FleetTruth<Self>>,
-        estimate: Option<&Estimate<Self>>,
+        estimate: impl Fn(usize) -> Option<&'a Estimate<Self>>,
         reference: &[f64],
         out: &mut [f64],
     ) {
         let () = Declared::<R>::EXIST;
-        for (value, Difference { field, compared, .. }) in out.iter_mut().zip(R::METRICS) {
+        let index_of = |name: &str| SimpleRig::bodies(self).iter().position(|body| body.name == name);
+        for (value, Difference { field, compared, body: only, .. }) in out.iter_mut().zip(R::METRICS) {
             let first = truth(0).map(|first| numbers(first, field));
             let worst = |error: &dyn Fn(&[f64]) -> f64| {
-                let bodies = SimpleRig::bodies(self).iter().enumerate().filter(|(_, body)| body.driven);
+                let judged = |body: &BodyInfo| only.map_or(body.driven, |only| body.name == only);
+                let bodies = SimpleRig::bodies(self).iter().enumerate().filter(|(_, body)| judged(body));
                 let errors =
                     bodies.map(|(index, _)| truth(index).map_or(f64::NAN, |truth| error(numbers(truth, field))));
                 errors.reduce(|a, b| if a.is_nan() || a > b { a } else { b }).unwrap_or(f64::NAN)
             };
             *value = match compared {
-                Compared::Estimate => distance(estimate.map(|estimate| numbers(estimate, field)), first),
+                Compared::Estimate => only.map_or(Some(0), index_of).map_or(f64::NAN, |index| {
+                    let own = truth(index).map(|truth| numbers(truth, field));
+                    distance(estimate(index).map(|estimate| numbers(estimate, field)), own)
+                }),
                 Compared::Driven => worst(&|own| distance(Some(own), first)),
                 Compared::Reference => worst(&|own| distance(Some(own), Declared::<R>::numbers(reference, field))),
                 Compared::Zero => worst(&|own| libm::sqrt(own.iter().map(|number| number * number).sum())),

@@ -16,9 +16,9 @@ pub trait WordGuard {
 
 /// A view of a rig's samples as words. Bodies are given by their index.
 pub trait WordView {
-    /// Returns the signals of all bodies in a scenario of this name.
-    fn signals(&self, scenario: &str) -> Vec<Port>;
-    /// Returns the number of words of a body's sample; `None` if the body has no such signal or the signal has another type.
+    /// Returns the signals of all bodies in a scenario of this name; `bodies` are those of the rig with their observers.
+    fn signals(&self, scenario: &str, bodies: &[BodyInfo]) -> Vec<Port>;
+    /// Returns the number of words of a body's sample; `None` if the body cannot have such a signal or the signal has another type.
     fn length(&self, body: usize, signal: Signal) -> Option<usize>;
     /// Returns the guard of a reader that observes a body's signal; `None` for a signal without one.
     fn guard(&self, body: usize, signal: Signal) -> Option<Box<dyn WordGuard>>;
@@ -37,9 +37,10 @@ pub trait WordView {
 }
 
 impl<R: Rig> WordView for R {
-    fn signals(&self, scenario: &str) -> Vec<Port> {
+    fn signals(&self, scenario: &str, bodies: &[BodyInfo]) -> Vec<Port> {
         let topic = |body: &str, signal| Topic { scenario: scenario.to_owned(), body: body.to_owned(), signal };
-        let estimate = Port::new::<Estimate<R>>(topic(&self.bodies()[0].name, Signal::Estimate), None);
+        let estimate = |body: &BodyInfo| Port::new::<Estimate<R>>(topic(&body.name, Signal::Estimate), None);
+        let observed = || bodies.iter().filter(|body| body.observer.is_some());
         let of_body = |body: &BodyInfo| {
             let command = topic(&body.name, Signal::Command);
             let command = body.driven.then(|| either::<Command<R>, FleetCommand<R>>(command, body.fleet));
@@ -51,8 +52,8 @@ impl<R: Rig> WordView for R {
                 command,
             ]
         };
-        let bodies = self.bodies().iter().flat_map(of_body).flatten();
-        std::iter::once(estimate).chain(bodies).collect()
+        let further = observed().skip(1).map(estimate);
+        observed().take(1).map(estimate).chain(bodies.iter().flat_map(of_body).flatten()).chain(further).collect()
     }
 
     fn length(&self, body: usize, signal: Signal) -> Option<usize> {
@@ -61,7 +62,7 @@ impl<R: Rig> WordView for R {
             (Signal::Truth, None) => size_of::<Truth<R>>(),
             (Signal::Truth, Some(bodies)) => return Some(FleetTruth::<R>::length(bodies)),
             (Signal::Measurement, None) => size_of::<Measurement<R>>(),
-            (Signal::Estimate, _) if body == 0 => size_of::<Estimate<R>>(),
+            (Signal::Estimate, None) => size_of::<Estimate<R>>(),
             (Signal::Command, None) if info.driven => size_of::<Command<R>>(),
             _ => return None,
         };
@@ -90,7 +91,8 @@ impl<R: Rig> WordView for R {
         let truth = |index: usize| words(index, Signal::Truth);
         let single = |index: usize| truth(index).filter(|_| bodies[index].fleet.is_none()).and_then(cast::<Truth<R>>);
         let fleet = |index: usize| truth(index).filter(|_| bodies[index].fleet.is_some()).map(FleetSample::over);
-        self.score(single, fleet, words(0, Signal::Estimate).and_then(cast::<Estimate<R>>), reference, out);
+        let estimate = |index: usize| words(index, Signal::Estimate).and_then(cast::<Estimate<R>>);
+        self.score(single, fleet, estimate, reference, out);
     }
 
     fn lyapunov_words(&self, command: &[u64]) -> Option<(f64, f64)> {

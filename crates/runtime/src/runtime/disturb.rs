@@ -118,7 +118,7 @@ impl LateSamples {
     pub fn for_signal(scenario: &Settings, signal: Signal, body: &str) -> Option<Box<Self>> {
         let role = match signal {
             Signal::Measurement => body,
-            Signal::Estimate => "observer",
+            Signal::Estimate => scenario.bodies.iter().find(|info| info.name == body)?.observer.as_deref()?,
             Signal::Command => "controller",
             _ => return None,
         };

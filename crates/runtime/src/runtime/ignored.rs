@@ -5,7 +5,7 @@ use crate::config::{InputInfo, Settings};
 
 /// Returns the reason why an input cannot change: a role that uses it, for which `ignores` returns true. `None` if every role takes it.
 pub fn ignoring_role(scenario: &Settings, info: &InputInfo, ignores: &dyn Fn(RoleId) -> bool) -> Option<String> {
-    let role = info.uses.iter().filter_map(|by| RoleId::using(by.user)).find(|role| ignores(*role))?;
+    let role = info.uses.iter().flat_map(|by| RoleId::using(scenario, by.user)).find(|role| ignores(*role))?;
     let (key, name) = (&info.key, role.name(scenario));
     Some(format!(
         "{key} is used by {name}, which another program runs: a device, another host, or a program that does not use this library \

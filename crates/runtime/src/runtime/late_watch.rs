@@ -114,7 +114,7 @@ impl LateWatch {
 fn expected_sender(role: RoleId) -> u64 {
     match role {
         RoleId::Plant(_) => 0,
-        RoleId::Observer => RoleId::Plant(0).number(),
-        RoleId::Controller => RoleId::Observer.number(),
+        RoleId::Observer(index) => RoleId::Plant(index).number(),
+        RoleId::Controller => RoleId::Observer(0).number(),
     }
 }

@@ -84,7 +84,7 @@ pub fn shared_memory_bytes(scenario: &Settings) -> usize {
         let signals = ports.writes.iter().chain([&ports.health]).map(port).sum::<usize>();
         signals + ledger_words(scenario, role) * size_of::<u64>() + record_bytes(scenario, &ports)
     };
-    let Ports { schedule, health, input, .. } = ports(scenario, RoleId::Observer);
+    let Ports { schedule, health, input, .. } = ports(scenario, RoleId::Observer(0));
     // The recorder publishes health too.
     COMMON_BYTES
         + ReceivedChanges::BYTES
@@ -218,7 +218,7 @@ fn role_node<R: Rig, B: Bus + 'static>(
                 Some(fleet) => Box::new(PlantNode::open(fleet.body(), fleet.command_guard(), info, context, None)?),
             }
         }
-        RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, context, source)?),
+        RoleId::Observer(index) => Box::new(observer::ObserverNode::<R, B>::open(rig, index, context, source)?),
         RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, context, source)?),
     })
 }
@@ -236,7 +236,7 @@ mod tests {
         for (name, text) in SHIPPED {
             let scenario = Scenario::parse(text, name, &[]).unwrap();
             let names: Vec<&str> = RoleId::all(&scenario).iter().map(|role| role.name(&scenario)).collect();
-            assert_eq!(names, scenario.rig.roles(), "{name}");
+            assert_eq!(names, scenario.roles(), "{name}");
         }
     }
 

@@ -177,14 +177,19 @@ fn cores(settings: &Realtime, has_realtime: bool) -> Vec<usize> {
 
 /// Returns the core of a role's process. Plants take turns over the cores, because all of them act at the due instant.
 /// Observer and controller get cores of their own if possible, else those of the leader and of the first follower,
-/// whose measurements they wait for. The first role decides for a process of several roles.
+/// whose measurements they wait for; then the other observers, else on the core of their body. The first role decides for a process of several roles.
 fn core_of(cores: &[usize], role: RoleId, scenario: &Settings) -> Option<usize> {
     let bodies = scenario.bodies.len();
     let own_or = |own: usize, beside: usize| if own < cores.len() { own } else { beside };
+    let observers_until = |last: usize| {
+        let bodies = scenario.bodies.get(1..=last).unwrap_or_default();
+        bodies.iter().filter(|body| body.observer.is_some()).count()
+    };
     let place = match role.process_role(scenario).process_members(scenario).first()? {
         RoleId::Plant(index) => *index,
-        RoleId::Observer => own_or(bodies, 0),
+        RoleId::Observer(0) => own_or(bodies, 0),
         RoleId::Controller => own_or(bodies + 1, 1),
+        RoleId::Observer(index) => own_or(bodies + 1 + observers_until(*index), *index),
     };
     cores.get(place % cores.len().max(1)).copied()
 }
@@ -298,7 +303,7 @@ mod tests {
 
     #[test]
     fn roles_share_cores_with_the_bodies_they_wait_for_unless_cores_suffice() {
-        let roles = [RoleId::Plant(0), RoleId::Plant(1), RoleId::Observer, RoleId::Controller];
+        let roles = [RoleId::Plant(0), RoleId::Plant(1), RoleId::Observer(0), RoleId::Controller];
         let places = |cores: &[usize], processes: &str| {
             let scenario = shipped("rigid-pair", &[processes]);
             roles.map(|role| core_of(cores, role, &scenario).unwrap())
@@ -338,7 +343,7 @@ mod tests {
     fn a_refused_privilege_is_reported_with_a_remedy() {
         let overrides = ["realtime.lock_memory=false", "realtime.priority=0", "realtime.cores=[1023]"];
         let scenario = shipped("rigid-pair", &overrides);
-        let Privileges { grants, has_realtime, co_located } = take_privileges(&scenario, RoleId::Observer);
+        let Privileges { grants, has_realtime, co_located } = take_privileges(&scenario, RoleId::Observer(0));
         assert_eq!((grants.len(), has_realtime, co_located), (1, false, Vec::new()));
         assert!(!grants[0].granted && grants[0].reason.contains("realtime.cores"), "{grants:?}");
     }

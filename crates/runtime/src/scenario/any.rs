@@ -4,7 +4,7 @@
 
 use crate::analysis::{self, Claim};
 use crate::bus::{AnyBus, BusError};
-use crate::config::{BodyInfo, InputInfo, Settings, role_names};
+use crate::config::{BodyInfo, InputInfo, Settings};
 use crate::direct;
 use crate::rig::{CertificateReport, Figure, Picture, Rig, WordView};
 use crate::runtime::{ReadyNode, RoleImpl, build_rig};
@@ -16,8 +16,10 @@ use std::sync::Arc;
 
 /// A rig of any type.
 pub trait AnyRig: WordView + Any + Send + Sync {
-    /// Returns the bodies; the first is the observed one.
+    /// Returns the bodies, without their observers, which are in the settings.
     fn bodies(&self) -> &[BodyInfo];
+    /// Returns true if the rig has an estimator for the body with this index.
+    fn observes(&self, index: usize) -> bool;
     /// Returns the names of the metrics of a run.
     fn metrics(&self) -> Vec<&'static str>;
     /// Returns the proofs about the closed loop, one per driven body.
@@ -70,6 +72,10 @@ pub trait AnyRig: WordView + Any + Send + Sync {
 impl<R: Rig> AnyRig for R {
     fn bodies(&self) -> &[BodyInfo] {
         Rig::bodies(self)
+    }
+
+    fn observes(&self, index: usize) -> bool {
+        self.estimator_of(index).is_some()
     }
 
     fn metrics(&self) -> Vec<&'static str> {
@@ -154,11 +160,6 @@ impl dyn AnyRig {
     /// Returns the rig if it is of this type.
     pub fn downcast_ref<R: Rig>(&self) -> Option<&R> {
         (self as &dyn Any).downcast_ref()
-    }
-
-    /// Returns the names of all roles, in the order in which a tick passes through them.
-    pub fn roles(&self) -> Vec<&str> {
-        role_names(self.bodies())
     }
 }
 

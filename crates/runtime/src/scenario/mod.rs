@@ -24,7 +24,8 @@ use crate::config::hosts::{self, Hosts};
 use crate::config::raw::{Launch, Policy, Raw};
 use crate::config::{
     BodyInfo, Checks, ClockKind, ConfigError, Cores, DISCONNECTED, Document, InputInfo, InputUser, Inputs, NotExternal,
-    Rates, Realtime, Settings, Shape, Supervision, Variability, fault, input, nearest, reference, sensor, watchdog,
+    Rates, Realtime, Settings, Shape, Supervision, Variability, fault, input, nearest, observe, reference, role_names,
+    sensor, watchdog,
 };
 use crate::control::{ACTUATION_DELAY_MAX, WatchBounds};
 use crate::rig::Context;
@@ -151,28 +152,32 @@ impl Scenario {
         rates.check(raw.actuator.command_timeout_ticks, last_tick, &mut checks);
         // A refused length or tick rate leads to no further errors.
         let duration_s = if length_possible(&raw) { raw.duration_s } else { f64::INFINITY };
-        let accept = resolve_accept(&raw, &metrics, duration_s, rig.as_deref(), &mut checks);
-        check_external(&raw, rig.as_deref().map(<dyn AnyRig>::roles), &mut checks);
+        let bodies = rig.as_ref().map_or_else(Vec::new, |rig| {
+            observe(raw.observed.as_deref(), rig.bodies(), |index| rig.observes(index), &mut checks)
+        });
+        let accept = resolve_accept(&raw, &metrics, duration_s, rig.as_deref(), &bodies, &mut checks);
+        check_external(&raw, rig.is_some().then(|| role_names(&bodies)), &mut checks);
         let hosts = Hosts { hosts: raw.host.clone(), network: raw.network.clone() };
         hosts::check_alone(&hosts, &raw.launch.processes, &raw.launch.external, &mut checks);
         let (mut faults, mut watch, mut signals) = (Vec::new(), WatchBounds::NONE, Vec::new());
         let (mut inputs, mut initial_reference) = (Inputs::default(), Vec::new());
         if let Some(rig) = &rig {
-            let bodies: Vec<(&str, bool)> = rig.bodies().iter().map(|body| (&*body.name, body.driven)).collect();
-            hosts::check(&hosts, &bodies, &rig.roles(), actuation_delay_ticks, &mut checks);
-            check_roles(&raw.supervision.on_failure, &rig.roles(), &mut checks);
+            hosts::check(&hosts, &bodies, actuation_delay_ticks, &mut checks);
+            check_roles(&raw.supervision.on_failure, &role_names(&bodies), &mut checks);
             let last_tick = if tick_possible(raw.tick_hz) && length_possible(&raw) { last_tick } else { u64::MAX };
-            signals = rig.signals(&raw.name);
+            signals = rig.signals(&raw.name, &bodies);
             let setting = fault::Setting {
-                bodies: rig.bodies(),
+                bodies: &bodies,
                 signals: &signals,
                 axes: rig.axes(),
                 last_tick,
                 seed: raw.seed,
                 actuation_delay_ticks,
             };
-            sensor::check(&raw.sensor, rig.bodies(), &signals, last_tick, &mut checks);
-            sensor::check_together(&raw.sensor, bodies[0].0, rates.observer_ticks, &mut checks);
+            sensor::check(&raw.sensor, &bodies, &signals, last_tick, &mut checks);
+            for body in bodies.iter().filter(|body| body.observer.is_some()) {
+                sensor::check_together(&raw.sensor, &body.name, rates.observer_ticks, &mut checks);
+            }
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
             inputs.infos = rig.inputs();
             inputs.infos.extend(actuator_switches(&raw, rig.bodies()));
@@ -227,7 +232,7 @@ impl Scenario {
             watch,
             accept,
             run: document.run(),
-            bodies: rig.bodies().to_vec(),
+            bodies,
             signals,
             monitors: rig.monitors().into_iter().map(|(name, _)| name).collect(),
         };
@@ -323,10 +328,10 @@ fn resolve_accept(
     metrics: &toml::Table,
     duration_s: f64,
     rig: Option<&dyn AnyRig>,
+    bodies: &[BodyInfo],
     checks: &mut Checks<'_>,
 ) -> Accept {
-    let (names, roles) = (rig.map(|rig| rig.metrics()), rig.map(<dyn AnyRig>::roles));
-    let bodies = rig.map_or(&[][..], |rig| rig.bodies());
+    let (names, roles) = (rig.map(|rig| rig.metrics()), rig.map(|_| role_names(bodies)));
     let driven: Vec<&str> = bodies.iter().filter(|body| body.driven).map(|body| &*body.name).collect();
     let setting = accept::Setting {
         duration_s,

@@ -3,7 +3,7 @@
 use super::process::{
     RoleError, device_failure_path, failure_path, find_role, in_domain, join, require_process, take_ledger, write_whole,
 };
-use crate::config::{ClockKind, Settings};
+use crate::config::{BodyInfo, ClockKind, Settings};
 use crate::runtime::{DeviceConfig, DeviceError, DeviceLink, NodeError, Pace, RoleId, RoleImpl};
 use crate::serial::LineCounters;
 use crate::telemetry::{Outage, PaceReport};
@@ -32,10 +32,14 @@ fn roles(scenario: &Settings, names: &[String]) -> Result<Vec<RoleId>, RoleError
     let single = |index: usize| bodies[index].fleet.is_none();
     let fits = match roles[..] {
         [RoleId::Plant(index)] => bodies[index].driven && single(index),
-        [RoleId::Observer] => true,
-        [RoleId::Controller] | [RoleId::Observer, RoleId::Controller] => (0..bodies.len()).all(single),
+        [RoleId::Observer(_)] => true,
+        [RoleId::Controller] | [RoleId::Observer(0), RoleId::Controller] => (0..bodies.len()).all(single),
         _ => false,
     };
+    let self_observed = |body: &&BodyInfo| body.driven && body.observer.is_some();
+    if let (true, Some(body)) = (roles.contains(&RoleId::Controller), bodies.iter().skip(1).find(self_observed)) {
+        return Err(RoleError::DeviceReadsOwn { body: body.name.to_string() });
+    }
     if fits {
         return Ok(roles);
     }

@@ -180,7 +180,7 @@ pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>)
         window_ticks: window_ticks(scenario),
         every_ticks: match role {
             RoleId::Controller => scenario.rates.controller_ticks,
-            RoleId::Observer => scenario.rates.observer_ticks,
+            RoleId::Observer(_) => scenario.rates.observer_ticks,
             RoleId::Plant(_) => 1,
         },
         actuation_delay_ticks: scenario.actuation_delay_ticks,
@@ -214,7 +214,7 @@ pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>)
 /// Describes the inputs of a scenario.
 fn inputs(scenario: &Scenario) -> Vec<InputDescription> {
     let describe = |(number, info): (usize, &InputInfo)| {
-        let roles = info.uses.iter().filter_map(|by| RoleId::using(by.user));
+        let roles = info.uses.iter().flat_map(|by| RoleId::using(scenario, by.user));
         let mut users: Vec<String> = roles.map(|role| role.name(scenario).to_owned()).collect();
         users.dedup();
         let (least, largest) = info.range;

@@ -103,6 +103,15 @@ pub enum RoleError {
         /// The driven bodies that are not fleets.
         driven: String,
     },
+    /// The controller reads an estimate that the protocol of devices does not carry.
+    #[error(
+        "a device cannot be the controller here: that reads the own estimate of {body}, which a device does not receive; take {body} \
+         out of `observed`, or run the controller as a program"
+    )]
+    DeviceReadsOwn {
+        /// The driven body with an observer of its own.
+        body: String,
+    },
     /// The device failed or cannot take part.
     #[error(transparent)]
     #[strum(transparent)]

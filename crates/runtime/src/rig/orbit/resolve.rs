@@ -244,12 +244,15 @@ impl Parts<'_> {
             .chain(self.followers.iter().map(|follower| (&follower.noise, &follower.bias)));
         let sensors: Vec<Sensors> =
             sensed.zip(0..).map(|((noise, bias), stream)| sensor(context, stream, noise, bias)).collect();
-        let follower = |raw: &RawFollower| BodyInfo { name: raw.name.clone().into(), driven: true, fleet: None };
-        let bodies = [BodyInfo { name: self.name.into(), driven, fleet: None }];
+        let body = |name: &str, driven| BodyInfo { name: name.to_owned().into(), driven, fleet: None, observer: None };
+        let bodies = [body(self.name, driven)];
         let thrust_max = self.controller.map_or(0.0, |(_, thrust_max, _)| thrust_max);
         let speed = Limits::resolve(self.limits, field, &initial, target, review.checks);
         let rig = OrbitRig {
-            bodies: bodies.into_iter().chain(self.followers.iter().map(follower)).collect(),
+            bodies: bodies
+                .into_iter()
+                .chain(self.followers.iter().map(|follower| body(&follower.name, true)))
+                .collect(),
             field,
             initial,
             limits: limits(field, speed, self.observer, &sensors[0], thrust_max, self.limits, context),

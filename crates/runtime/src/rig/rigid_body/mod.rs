@@ -357,7 +357,7 @@ impl Rig for RigidBodyRig {
         &self,
         truth: impl Fn(usize) -> Option<&'a RateTruth>,
         fleet: impl Fn(usize) -> Option<&'a FleetTruth>,
-        estimate: Option<&RateEstimate>,
+        estimate: impl Fn(usize) -> Option<&'a RateEstimate>,
         _reference: &[f64],
         out: &mut [f64],
     ) {
@@ -366,7 +366,7 @@ impl Rig for RigidBodyRig {
             (Some(from), Some(to)) => (from - to).norm(),
             _ => f64::NAN,
         };
-        let leader = rate(0);
+        let (leader, estimate) = (rate(0), estimate(0));
         let follower = |index: usize| {
             let reference = leader.map(|leader| leader + self.offsets_rad_s[index]);
             match (self.bodies[index].fleet, reference) {

@@ -43,7 +43,7 @@ pub(super) fn resolve(
     let observer = design_observer(&raw, &inertia, supplied_axis, context.tick_s, &mut notes, checks);
     let Some(observer) = observer else { return Ok((None, table)) };
     let mut rig = RigidBodyRig {
-        bodies: vec![BodyInfo { name: "leader".into(), driven: false, fleet: None }],
+        bodies: vec![BodyInfo::free("leader")],
         inertia,
         spreads: vec![Vector3::zeros()],
         seed: context.seed,
@@ -79,7 +79,8 @@ pub(super) fn resolve(
         checks.accept(&format!("follower[{index}].inertia_factor"), Inertia::new(own.into()));
         rig.initial_rates.push(follower.initial_rate_rad_s.into());
         rig.spreads.push(follower.spread_rad_s().into());
-        rig.bodies.push(BodyInfo { fleet: follower.fleet(), name: follower.name.into(), driven: true });
+        let (fleet, name) = (follower.fleet(), follower.name.into());
+        rig.bodies.push(BodyInfo { name, driven: true, fleet, observer: None });
         rig.inertia_factors.push(factor);
         rig.noise.push(noise(context, index as u64 + 1, follower.noise_rad_s, follower.bias_rad_s));
         rig.deviations_rad_s.push(follower.noise_rad_s.into());

@@ -1,10 +1,10 @@
-//! A controller on a bus: reads the estimate and the measurement of every driven body, sends a command to each.
+//! A controller on a bus: reads the first body's estimate, and measurement and own estimate of every driven body; sends a command to each.
 
-use super::channel::{AnyChannel, Channel, Channels, Stages};
+use super::channel::{AnyChannel, Channel, Channels, Single, Stages};
 use super::context::{LOOK_NS, NodeContext};
 use super::contract::{Node, Poll, RunCondition};
 use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
-use super::ports::driven;
+use super::ports::{driven, is_self_observed};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::config::InputUser;
@@ -53,12 +53,17 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
             Channel::open(index, (body, command), rig.law(index), rig.measurement_guard(index, true), context)
         };
-        let single = bodies(false).zip(commands).map(channel).collect::<Result<_, BusError>>()?;
+        let mut single = bodies(false).zip(commands).map(channel).collect::<Result<Vec<Single<R, B>>, BusError>>()?;
         let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
             let fleet = rig.fleet(index)?;
             Some(Channel::open(index, (body, command), fleet.law(), fleet.measurement_guard(), context))
         };
         let fleets = bodies(true).zip(fleet_commands).filter_map(channel).collect::<Result<_, BusError>>()?;
+        for (channel, (index, body)) in single.iter_mut().zip(bodies(false)) {
+            if is_self_observed(index, &context.scenario.bodies[index]) {
+                channel.own_estimate = Some(context.input(body, Signal::Estimate, rig.estimate_guard())?);
+            }
+        }
         Ok(Self {
             rig: rig.clone(),
             estimate,
@@ -217,7 +222,8 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let due = stamp.tick.is_multiple_of(self.every_ticks);
         if let Some(source) = self.source.as_mut().filter(|_| due) {
             let estimate = std::iter::once(self.estimate.sample().map(Message::words));
-            match source.tick(stamp.tick, estimate.chain(self.channels.iter().map(AnyChannel::words)))? {
+            let own = self.channels.single.iter().filter_map(Channel::own_words);
+            match source.tick(stamp.tick, estimate.chain(self.channels.iter().map(AnyChannel::words)).chain(own))? {
                 Progress::Done => {
                     began_ns = source.asked_ns(stamp.tick).unwrap_or(began_ns);
                     // A device that also computes the estimate was asked before the estimate was sent.
@@ -263,7 +269,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         self.skip_to(stamp.tick);
         if starved {
             let absent = self.channels.iter().find_map(AnyChannel::absent);
-            self.counters.starved(stamp.tick, absent.map_or(0, |body| RoleId::Plant(body).number()));
+            self.counters.starved(stamp.tick, absent.map_or(0, RoleId::number));
         }
         self.counters.executed();
         commit(self);
@@ -325,7 +331,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     fn awaits(&self) -> Option<RoleId> {
         let next = self.counters.next();
         let late = self.channels.iter().find_map(|channel| channel.late(next));
-        Some(late.map_or(RoleId::Observer, RoleId::Plant))
+        Some(late.unwrap_or(RoleId::Observer(0)))
     }
 
     /// The estimate usually arrives last; the other inputs are there by then.
@@ -337,7 +343,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         } else if self.lacks_estimate() {
             self.estimate.sleep(until_ns)?;
         } else if let Some(late) = self.channels.iter_mut().find(|channel| channel.late(tick).is_some()) {
-            late.sleep(until_ns)?;
+            late.sleep(tick, until_ns)?;
         } else {
             return Ok(false);
         }
@@ -434,6 +440,8 @@ impl<R: Rig, B: Bus> Persistent for ControllerNode<R, B> {
         self.estimate.counters().persist(words);
         self.channels.single.iter_mut().for_each(|channel| channel.measurement.counters().persist(words));
         self.channels.fleets.iter_mut().for_each(|fleet| fleet.measurement.counters().persist(words));
+        let own = self.channels.single.iter_mut().filter_map(|channel| channel.own_estimate.as_mut());
+        own.for_each(|own| own.counters().persist(words));
         self.watchdog.persist(words);
     }
 

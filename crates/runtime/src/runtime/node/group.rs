@@ -131,8 +131,9 @@ impl GroupNode {
         let lacks = move |member: &Member| {
             let next = member.node.next_tick();
             let due = self.open.is_none_or(|tick| next <= tick) && !self.timed(member);
-            let behind = member.role == RoleId::Controller
-                && inside(RoleId::Observer).is_some_and(|observer| observer.next_tick() <= next);
+            let mut observers = self.members.iter().filter(|member| matches!(member.role, RoleId::Observer(_)));
+            let behind =
+                member.role == RoleId::Controller && observers.any(|observer| observer.node.next_tick() <= next);
             due && !behind && member.node.awaits().is_some_and(|role| inside(role).is_none())
         };
         self.members.iter().enumerate().filter(move |(_, member)| lacks(member)).map(|(index, _)| index)
@@ -248,14 +249,14 @@ mod tests {
     const LAST: u64 = 6;
     /// The tick whose measurement of the leader is dropped.
     const LOST: u64 = 3;
-    const GROUP: [RoleId; 2] = [RoleId::Observer, RoleId::Controller];
+    const GROUP: [RoleId; 2] = [RoleId::Observer(0), RoleId::Controller];
 
     fn enter(domain: &OwnedDomain, scenario: &Scenario) -> IoxBus {
         IoxBus::enter(domain.domain(), "test", depths(scenario)).unwrap()
     }
 
     fn open(scenario: &Scenario, bus: &IoxBus, books: &[Ledger; 2]) -> ReadyNode {
-        let observer = vec![(RoleId::Observer, books[0].reopened())];
+        let observer = vec![(RoleId::Observer(0), books[0].reopened())];
         build(scenario, RoleImpl::Role(RoleId::Controller, observer), bus, &books[1]).unwrap()
     }
 

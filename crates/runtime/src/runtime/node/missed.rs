@@ -116,8 +116,8 @@ mod tests {
         let scenario = scenario();
         let domain = OwnedDomain::create(0).unwrap();
         let bus = IoxBus::enter(domain.domain(), "test", depths(&scenario)).unwrap();
-        let books = private_ledger(&scenario, RoleId::Observer);
-        let mut observer = build(&scenario, RoleId::Observer, &bus, &books).unwrap();
+        let books = private_ledger(&scenario, RoleId::Observer(0));
+        let mut observer = build(&scenario, RoleId::Observer(0), &bus, &books).unwrap();
         let topic = topic(&scenario, "leader", Signal::Measurement);
         let mut measurements = bus.writer::<RateMeasurement>(&topic, 1).unwrap();
         let grid = Grid { epoch_ns: monotonic_ns() - 1000 * MS, period_ns: MS };

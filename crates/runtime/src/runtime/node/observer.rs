@@ -1,4 +1,4 @@
-//! An observer on a bus: reads the leader's measurement, sends the estimate.
+//! An observer on a bus: reads the measurement of its body, sends the estimate.
 
 use super::context::{LOOK_NS, NodeContext};
 use super::contract::{Node, Poll, RunCondition};
@@ -8,7 +8,7 @@ use super::persistent::{Inherited, Persistent, commit, commit_last, length, rest
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::config::InputUser;
-use crate::rig::{Estimate, Measurement, Rig, observer};
+use crate::rig::{Estimate, Measurement, Rig, further_observer, observer};
 use crate::role::Observer;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::error::NodeError;
@@ -34,6 +34,8 @@ struct Instants {
 
 /// An observer with its links and counters.
 pub struct ObserverNode<R: Rig, B: Bus> {
+    /// The index of its body.
+    body: usize,
     observer: Observer<R::Estimator>,
     measurement: Input<B, Measurement<R>, R::MeasurementGuard>,
     estimate: Output<B, Estimate<R>>,
@@ -54,12 +56,19 @@ pub struct ObserverNode<R: Rig, B: Bus> {
 }
 
 impl<R: Rig, B: Bus> ObserverNode<R, B> {
-    pub fn open(rig: &R, context: &NodeContext<'_, B>, source: Option<SampleSource>) -> Result<Self, BusError> {
-        let leader = &rig.bodies()[0];
-        let estimate = context.output(leader, Signal::Estimate)?;
+    /// Opens the observer of the body with index `body`.
+    pub fn open(
+        rig: &R,
+        body: usize,
+        context: &NodeContext<'_, B>,
+        source: Option<SampleSource>,
+    ) -> Result<Self, BusError> {
+        let info = &rig.bodies()[body];
+        let estimate = context.output(info, Signal::Estimate)?;
         Ok(Self {
-            observer: observer(rig, context.scenario),
-            measurement: context.input(leader, Signal::Measurement, rig.measurement_guard(0, false))?,
+            body,
+            observer: further_observer(rig, body, context.scenario).unwrap_or_else(|| observer(rig, context.scenario)),
+            measurement: context.input(info, Signal::Measurement, rig.measurement_guard(body, false))?,
             estimate,
             held: Held::new(context.scenario.rates.observer_ticks, 1),
             clock: context.clock,
@@ -219,7 +228,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     }
 
     fn awaits(&self) -> Option<RoleId> {
-        Some(RoleId::Plant(0))
+        Some(RoleId::Plant(self.body))
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
@@ -242,7 +251,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
             self.step.record(received, done);
             self.age.record(origin, done);
             if done.saturating_sub(origin) > self.late_ns {
-                let sender = RoleId::Plant(0).number();
+                let sender = RoleId::Plant(self.body).number();
                 let (due_ns, input_ns, began_ns, done_ns) = (origin, sent, received, done);
                 let instants = LateRecord { due_ns, input_ns, began_ns, done_ns, ..LateRecord::default() };
                 self.counters.late(LateRecord { tick, sender, ..instants });

@@ -28,6 +28,11 @@ pub(super) fn driven(bodies: &[BodyInfo]) -> impl Iterator<Item = (usize, &BodyI
     driven().filter(|(_, body)| body.fleet.is_none()).chain(driven().filter(|(_, body)| body.fleet.is_some()))
 }
 
+/// Returns true if the controller reads the estimate of this driven body beside that of the first body.
+pub(super) fn is_self_observed(index: usize, body: &BodyInfo) -> bool {
+    index > 0 && body.observer.is_some()
+}
+
 /// Returns the signals of a role.
 ///
 /// # Panics
@@ -44,10 +49,14 @@ pub fn ports(settings: &Settings, role: RoleId) -> Ports {
             let command = body.driven.then(|| port(body, Signal::Command));
             (vec![port(body, Signal::Measurement), port(body, Signal::Truth)], command.into_iter().collect())
         }
-        RoleId::Observer => (vec![port(&bodies[0], Signal::Estimate)], vec![port(&bodies[0], Signal::Measurement)]),
+        RoleId::Observer(index) => {
+            (vec![port(&bodies[index], Signal::Estimate)], vec![port(&bodies[index], Signal::Measurement)])
+        }
         RoleId::Controller => {
             let measurements = driven(bodies).map(|(_, body)| port(body, Signal::Measurement));
-            let reads = std::iter::once(port(&bodies[0], Signal::Estimate)).chain(measurements);
+            let own_estimates = driven(bodies).filter(|(index, body)| is_self_observed(*index, body));
+            let own_estimates = own_estimates.map(|(_, body)| port(body, Signal::Estimate));
+            let reads = std::iter::once(port(&bodies[0], Signal::Estimate)).chain(measurements).chain(own_estimates);
             (driven(bodies).map(|(_, body)| port(body, Signal::Command)).collect(), reads.collect())
         }
     };
