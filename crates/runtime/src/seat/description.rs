@@ -38,9 +38,9 @@ pub struct SeatDescription {
     last_tick: u64,
     /// Number of ticks that a plant may run ahead of the credit in lockstep.
     window_ticks: u64,
-    /// Number of ticks from a measurement until its command acts.
     /// The role computes at every n-th tick, from tick 0 on.
     every_ticks: u64,
+    /// Number of ticks from a measurement until its command acts.
     actuation_delay_ticks: u64,
     command_timeout_ticks: u64,
     rearm: &'static str,
