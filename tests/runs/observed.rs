@@ -145,13 +145,16 @@ fn score_report_and_seat_tell_each_estimate() {
     let seat: Value = serde_json::from_str(&bench.run(&["seat", "both/scenario.toml", "controller"]).stdout).unwrap();
     let reads: Vec<&str> =
         seat["reads"].as_array().unwrap().iter().map(|signal| signal["service"].as_str().unwrap()).collect();
-    let of = |name: &str| format!("corotate/carts/{name}");
-    assert_eq!(reads, ["leader/estimate", "follower/measurement", "other/measurement", "follower/estimate"].map(of));
+    let service = |name: &str| format!("corotate/carts/{name}");
+    assert_eq!(
+        reads,
+        ["leader/estimate", "follower/measurement", "other/measurement", "follower/estimate"].map(service)
+    );
     let seat = bench.run(&["seat", "both/scenario.toml", "observer-follower"]).succeeded();
     let seat: Value = serde_json::from_str(&seat.stdout).unwrap();
     assert_eq!(
         (&seat["kind"], seat["reads"][0]["service"].as_str()),
-        (&json!("observer"), Some(&*of("follower/measurement")))
+        (&json!("observer"), Some(&*service("follower/measurement")))
     );
 }
 
