@@ -6,7 +6,7 @@
 //! constants of integration are unknown. This module must not store a sample longer than its two neighbours, nor join
 //! a motion across a gap.
 
-use nalgebra::{Matrix3, SMatrix, SVector, SymmetricEigen, Vector3};
+use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
 /// The number of features: ω, the integrals of ω_x², ω_y², ω_z², ω_y ω_z, ω_z ω_x, ω_x ω_y, and the integral of ω.
 pub(super) const FEATURES: usize = 12;
@@ -29,6 +29,7 @@ const PIECE_SAMPLES: u64 = 4;
 pub(super) const SWEEPS: usize = 200;
 
 /// The part of white noise in differences of third order.
+#[cfg(feature = "std")]
 const THIRD_POWER: f64 = 20.0;
 
 /// A sample of a log.
@@ -177,17 +178,20 @@ impl Motion {
     }
 
     /// Returns the variance of white noise in each rate, (rad/s)²: what differences of third order leave of the motion.
+    #[cfg(feature = "std")]
     pub(super) fn noise(&self) -> Vector3<f64> {
         self.third.0 / (THIRD_POWER * self.third.1.max(1) as f64)
     }
 
     /// Returns the mean square of the rate about the axis with the most, then the next, (rad/s)², with the direction of the first.
+    #[cfg(feature = "std")]
     pub(super) fn turns(&self) -> Option<([f64; 2], Vector3<f64>)> {
         let mean = self.square / self.summary.samples.max(1) as f64;
         if !mean.iter().all(|entry| entry.is_finite()) {
             return None;
         }
-        let SymmetricEigen { eigenvalues, eigenvectors } = SymmetricEigen::try_new(mean, f64::EPSILON, SWEEPS)?;
+        let nalgebra::SymmetricEigen { eigenvalues, eigenvectors } =
+            nalgebra::SymmetricEigen::try_new(mean, f64::EPSILON, SWEEPS)?;
         let most = eigenvalues.imax();
         let next = (0..3).filter(|axis| *axis != most).map(|axis| eigenvalues[axis]).fold(0.0, f64::max);
         Some(([eigenvalues[most], next], eigenvectors.column(most).into_owned()))

@@ -78,6 +78,7 @@ impl Motion {
 
     /// Fits a tensor, the whole one or about the sensor's axes, to the motion of rates times `scale`. Returns the unexplained part
     /// of the variance of all rates; `None` if no body has the tensor.
+    #[cfg(feature = "std")]
     pub(super) fn unexplained(&self, whole: bool, scale: f64) -> Option<f64> {
         let mut total = self.total();
         for product in PRODUCTS..TURNS {
