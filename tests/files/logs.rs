@@ -151,7 +151,7 @@ fn units_that_are_impossible_or_not_known_are_refused_by_name() {
     let slow = |rad_s: f64, per_second: f64| {
         motion(400).into_iter().fold("t,wx,wy,wz\n".to_owned(), |mut text, [t, x, y, z]| {
             let [x, y, z] = [x, y, z].map(|rate| 0.02 * rate / rad_s);
-            writeln!(text, "{:.1},{x:.9},{y:.9},{z:.9}", t * 50.0 * per_second).unwrap();
+            writeln!(text, "{:.6},{x:.9},{y:.9},{z:.9}", t * 50.0 * per_second).unwrap();
             text
         })
     };
