@@ -12,6 +12,7 @@ use serde_json::Value;
 use sites::{APART_S, Site, apart, free_port, sites};
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::{Condvar, Mutex, PoisonError};
 
 /// The plants on one host, observer and controller on another: every signal of the loop crosses.
 const TWO: [(&str, &[&str]); 2] = [("bench", &["leader", "follower"]), ("flight", &["observer", "controller"])];
@@ -34,11 +35,35 @@ struct Run {
     file: PathBuf,
     port: u16,
     hosts: Vec<&'static str>,
+    _turn: Turn,
+}
+
+/// The number of runs at present. Each has nine processes or more: more runs than cores miss their limits in real time.
+static RUNS: (Mutex<usize>, Condvar) = (Mutex::new(0), Condvar::new());
+
+/// A run's turn, which others wait for.
+struct Turn;
+
+impl Turn {
+    fn take() -> Self {
+        let most = std::thread::available_parallelism().map_or(2, usize::from);
+        let runs = RUNS.0.lock().unwrap_or_else(PoisonError::into_inner);
+        *RUNS.1.wait_while(runs, |runs| *runs >= most).unwrap_or_else(PoisonError::into_inner) += 1;
+        Self
+    }
+}
+
+impl Drop for Turn {
+    fn drop(&mut self) {
+        *RUNS.0.lock().unwrap_or_else(PoisonError::into_inner) -= 1;
+        RUNS.1.notify_one();
+    }
 }
 
 impl Run {
     /// Without a `silence_timeout_s` in `tables` the timeout is long, because hosts are silent for longer on a loaded machine.
     fn new(hosts: &[(&'static str, &'static [&'static str])], keys: &str, tables: &str) -> Self {
+        let turn = Turn::take();
         let sites = sites(hosts.len());
         let long = "[network]\nsilence_timeout_s = 60.0";
         let tables = match tables {
@@ -48,7 +73,8 @@ impl Run {
         };
         let tables = &tables;
         let file = scenario(&sites[0].bench.path(""), hosts, keys, tables);
-        Self { file, port: free_port(), hosts: hosts.iter().map(|(name, _)| *name).collect(), sites }
+        let hosts = hosts.iter().map(|(name, _)| *name).collect();
+        Self { file, port: free_port(), hosts, sites, _turn: turn }
     }
 
     fn file(&self) -> &str {
