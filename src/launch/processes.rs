@@ -76,7 +76,7 @@ const SIGNALLED_END_LIMIT: Duration = Duration::from_millis(300);
 /// Time from the receipt of a change to the first tick at which it may act, ns: longer than a role takes for a tick, and than this
 /// process is usually held up.
 const CHANGE_LEAD_NS: u64 = 3_000_000;
-/// The same time for a run over several hosts: the change must cross the network. Relays repeat a lost message after 20 ms.
+/// The same for a run over several hosts, whose network the change must cross: relays repeat a lost message after 20 ms.
 const CHANGE_LEAD_HOSTS_NS: u64 = 300_000_000;
 /// Time without progress after which the run counts as hung, ns and periods.
 const HUNG_NS: u64 = 30_000_000_000;
