@@ -17,8 +17,8 @@ use std::path::PathBuf;
 /// The name of the process.
 pub const TRACER: &str = "tracer";
 /// The longest wait of another process for the findings, and the interval between two looks at them, ns. At its end the process decodes
-/// many events.
-const FINDINGS_NS: u64 = 6_000_000_000;
+/// many events. Shorter than the launcher's wait for companions, so that a recording is complete even if the process hangs.
+const FINDINGS_NS: u64 = 25_000_000_000;
 const LOOK_NS: u64 = 5_000_000;
 
 /// Findings of the process.
