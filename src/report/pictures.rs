@@ -9,6 +9,7 @@ use super::model::{Block, Section};
 use super::source::Source;
 use super::traces::{BODIES_SHOWN, Key, MetricTrace, Traces, observer_name};
 use crate::analysis::digits;
+use crate::bus::Signal;
 use crate::rig;
 use crate::scenario::Scenario;
 use crate::scenario::claims;
@@ -23,6 +24,9 @@ const FOLLOWERS: [&str; BODIES_SHOWN] = ["o d0 wide", "g d3 wide", "p d4 wide", 
 const OBSERVERS: [&str; BODIES_SHOWN] = ["o d1", "g d1", "p d1", "y d0"];
 /// The classes of colour and dash pattern of components and metrics.
 const COMPONENTS: [&str; 4] = ["o d0", "b d1", "g d3", "p d4"];
+/// The classes of a component of a command as it acts, and as it was asked for.
+const COMMANDS: [[&str; 2]; 4] =
+    [["o d0", "o d4 thin"], ["b d1", "b d4 thin"], ["g d3", "g d4 thin"], ["p d0", "p d4 thin"]];
 /// The decades of lateness from the lightest to the darkest shade, starting at 1 µs.
 const SHADE_DECADES: f64 = 5.0;
 
@@ -218,21 +222,30 @@ fn same(a: &Columns<Extremes>, b: &Columns<Extremes>) -> bool {
     a.iter().zip(b.iter()).all(|((_, a), (_, b))| a.is_empty() || a == b)
 }
 
-/// Draws the applied commands of each driven body.
+/// Draws the commands of each driven body, as they were asked for and as they acted.
 fn input_figures(inputs: &rig::Inputs, traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
     let mut figures = Vec::new();
+    let (signal, applied) = inputs.applied;
     for body in traces.bodies.iter().take(BODIES_SHOWN + 1) {
-        let component = |(element, name): (usize, &&str)| {
-            let columns = traces.get(body, "truth", inputs.field, element)?;
-            Some((columns, Line::over_time(COMPONENTS[element % COMPONENTS.len()], name, columns, tick_s)))
+        let component = |(element, name): (usize, &String)| {
+            let line = |class, label: String, columns| (columns, Line::over_time(class, &label, columns, tick_s));
+            let [strong, fine] = COMMANDS[element % COMMANDS.len()];
+            // An undriven body has none.
+            let asked = traces.get(body, Signal::Command.name(), inputs.field, element)?;
+            let applied = traces.get(body, signal.name(), applied, element);
+            let applied = applied.map(|columns| line(strong, format!("{name} applied"), columns));
+            Some([applied, Some(line(fine, format!("{name} asked for"), asked))])
         };
-        let (columns, lines) = present(inputs.components.iter().enumerate().map(component));
+        let (columns, lines) = present(inputs.components.iter().enumerate().filter_map(component).flatten());
         let (low, high) = range(columns, false);
-        // An undriven body has no chart.
         if low < 0.0 || high > 0.0 {
             let title = format!("control of {body} over time");
-            let picture = over_time(&title, time, &Axis::around(inputs.axis, (low, high)), &lines);
-            figures.push((picture, format!("Command applied by the actuators of {body}.")));
+            let picture = over_time(&title, time, &Axis::around(&inputs.axis, (low, high)), &lines);
+            let caption = format!(
+                "Commands for {body}: as the controller asked for them at each tick, and as the body reports that they act from each \
+                 tick on."
+            );
+            figures.push((picture, caption));
         }
     }
     figures

@@ -43,6 +43,11 @@ fn clocks_kills_and_replay_give_the_same_bits() {
     let lockstep = run(&bench, "lockstep", &["--record"]);
     assert_eq!(hash(&lockstep), hash(&expected));
     assert!(bench.run(&["replay", "lockstep", "--json"]).succeeded().roles_replayed().0 > 0);
+    bench.run(&["report", "lockstep", "--out", "page.html"]).succeeded();
+    let page = std::fs::read_to_string(bench.path("page.html")).unwrap();
+    for line in ["force asked for", "force applied"] {
+        assert_eq!(page.matches(&format!("data-label=\"{line}\"")).count(), 1, "{line}");
+    }
     for role in ["cart", "observer", "controller"] {
         let fault = format!("fault=[{{ kind = \"kill\", role = \"{role}\", from_tick = 500 }}]");
         let killed = run(&bench, "lockstep", &["--set", &fault]);

@@ -506,6 +506,19 @@ fn a_million_ticks_fit_in_two_megabytes_with_every_spike() {
     assert!(text(first).contains('5'), "the axis reaches the spike");
 }
 
+/// A saturated actuator applies less than was asked for: both are drawn, of the driven bodies only.
+#[test]
+fn commands_are_drawn_as_asked_for_and_as_applied() {
+    let bench = Bench::new();
+    for (scenario, names) in [("rigid-pair", &["u1", "u2", "u3"][..]), ("orbit-hold", &["Ur", "Uθ"])] {
+        let html = page(&bench, &run_recorded(&bench, scenario, &["--duration", "1", "--set", "accept={}"]));
+        let drawn = |name: &str, what: &str| html.matches(&format!("data-label=\"{name} {what}\"")).count();
+        for name in names {
+            assert_eq!((drawn(name, "asked for"), drawn(name, "applied")), (1, 1), "{scenario}: {name}");
+        }
+    }
+}
+
 /// Draws the coefficients of an identifier, noisy measurements, and fields chosen with --show.
 #[test]
 fn coefficients_measurements_and_chosen_fields_are_drawn() {

@@ -244,9 +244,9 @@ pub trait Rig: Clone + Send + Sync + 'static {
     fn lyapunov(_command: &Command<Self>) -> Option<(f64, f64)> {
         None
     }
-    /// Returns the pictures of the motion in a report; by default every number of the truth over time.
+    /// Returns the pictures of the motion in a report; by default every number of the truth over time, and the commands.
     fn pictures() -> Vec<Picture> {
-        graphs::<Truth<Self>>()
+        graphs::<Truth<Self>, Measurement<Self>, Command<Self>>()
     }
     /// Returns overrides that turn this scenario into a reference run, whose motion a report draws beside this one; empty for
     /// none.

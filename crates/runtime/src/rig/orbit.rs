@@ -16,9 +16,10 @@ pub use roles::{OrbitLaw, OrbitObserver, OrbitPlant};
 
 use super::contract::pair;
 use super::{
-    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FleetTruth, Graph, Monitor, NoFleet, Picture, Plane,
-    Rig, Start, Watched,
+    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FleetTruth, Graph, Inputs, Monitor, NoFleet,
+    Picture, Plane, Rig, Start, Watched,
 };
+use crate::bus::Signal;
 use crate::config::{Checks, ConfigError, Document, InputInfo};
 use crate::control::{Condition, OrbitCertificate, OrbitHold};
 use crate::model::{Noise, OrbitFault, OrbitState};
@@ -377,6 +378,12 @@ impl Rig for OrbitRig {
             graph("angle_rad", 0, "θ, rad", "Angle, counted on over full turns."),
             graph("applied_du_s2", 0, "Ur, du/s²", "Radial thrust per mass, as applied."),
             graph("applied_du_s2", 1, "Uθ, du/s²", "Transverse thrust per mass, as applied."),
+            Picture::Inputs(Inputs {
+                field: "thrust_du_s2",
+                applied: (Signal::Truth, "applied_du_s2"),
+                axis: "thrust per mass, du/s²".to_owned(),
+                components: ["Ur", "Uθ"].map(str::to_owned).to_vec(),
+            }),
             Picture::Onset,
         ]
     }

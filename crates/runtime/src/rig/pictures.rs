@@ -2,6 +2,7 @@
 //!
 //! This file draws nothing.
 
+use crate::bus::Signal;
 use crate::sample::{Field, FieldKind, Sample};
 
 /// A picture of the motion.
@@ -11,7 +12,7 @@ pub enum Picture {
     Plane(Plane),
     /// An element of every body's truth, and of the observed body's estimate, over time.
     Graph(Graph),
-    /// The applied input: one picture per driven body, one line per component.
+    /// The command asked for, and the one that acts: one picture per driven body, two lines per component.
     Inputs(Inputs),
     /// A Lyapunov function published with commands ([`super::Rig::lyapunov`]), in a section of its own.
     Lyapunov(Lyapunov),
@@ -54,15 +55,17 @@ pub struct Graph {
     pub caption: String,
 }
 
-/// The components of a field over time.
+/// A field of commands over time, beside what acts of it.
 #[derive(Debug, Clone)]
 pub struct Inputs {
-    /// The field of truths.
+    /// The field of commands.
     pub field: &'static str,
+    /// The signal and the field in which a body reports what acts.
+    pub applied: (Signal, &'static str),
     /// The name of the axis, with its unit.
-    pub axis: &'static str,
+    pub axis: String,
     /// The names of its elements.
-    pub components: &'static [&'static str],
+    pub components: Vec<String>,
 }
 
 /// A Lyapunov function V and its rate of decrease.
@@ -78,17 +81,54 @@ pub struct Lyapunov {
     pub bound: &'static str,
 }
 
-/// Returns a graph over time of every number of a truth, named after its fields and units.
-pub fn graphs<S: Sample>() -> Vec<Picture> {
-    let numbers = S::FIELDS.iter().filter(|field| field.kind == FieldKind::F64);
+/// Returns a graph over time of every number of a truth, named after its fields and units, and of every command that the truth or the
+/// measurement reports as it acts: in a field with its name, or with the prefix `applied_`.
+pub fn graphs<T: Sample, M: Sample, C: Sample>() -> Vec<Picture> {
     let graph = |field: &Field, element: usize| {
-        let (name, unit) = named(field.name);
-        let name = if field.count > 1 { format!("{name} {}", element + 1) } else { name };
-        let axis = if unit.is_empty() { name.clone() } else { format!("{name}, {unit}") };
+        let (name, axis) = (component(field, element), axis(&component(field, element), field));
         let title = format!("{name} over time");
         Picture::Graph(Graph { title, field: field.name, element, axis: axis.clone(), caption: format!("{axis}.") })
     };
-    numbers.flat_map(|field| (0..field.count).map(move |element| graph(field, element))).collect()
+    let inputs = |field: &Field| {
+        let signals = [(Signal::Truth, T::FIELDS), (Signal::Measurement, M::FIELDS)];
+        let mut reported = signals.into_iter().flat_map(|(signal, fields)| fields.iter().map(move |own| (signal, own)));
+        let (signal, report) = reported.find(|(_, report)| {
+            let same = applied(report).unwrap_or(report.name) == field.name;
+            same && (report.kind, report.count) == (field.kind, field.count)
+        })?;
+        Some(Picture::Inputs(Inputs {
+            field: field.name,
+            applied: (signal, report.name),
+            axis: axis(&named(field.name).0, field),
+            components: (0..field.count).map(|element| component(field, element)).collect(),
+        }))
+    };
+    // Drawn beside what was asked for.
+    let acts = |field: &&Field| applied(field).is_some_and(|name| numbers::<C>().any(|command| command.name == name));
+    let graphs = numbers::<T>().filter(|field| !acts(field));
+    let graphs = graphs.flat_map(|field| (0..field.count).map(move |element| graph(field, element)));
+    graphs.chain(numbers::<C>().filter_map(inputs)).collect()
+}
+
+/// Returns the name of the command's field whose applied value a field reports.
+fn applied(field: &Field) -> Option<&'static str> {
+    field.name.strip_prefix("applied_")
+}
+
+fn numbers<S: Sample>() -> impl Iterator<Item = &'static Field> {
+    S::FIELDS.iter().filter(|field| field.kind == FieldKind::F64)
+}
+
+/// Returns the name of an element of a field.
+fn component(field: &Field, element: usize) -> String {
+    let (name, _) = named(field.name);
+    if field.count > 1 { format!("{name} {}", element + 1) } else { name }
+}
+
+/// Returns the name of an axis with the unit of a field.
+fn axis(name: &str, field: &Field) -> String {
+    let (_, unit) = named(field.name);
+    if unit.is_empty() { name.to_owned() } else { format!("{name}, {unit}") }
 }
 
 /// The units that may end a field's name, and their symbols.

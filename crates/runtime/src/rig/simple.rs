@@ -2,7 +2,9 @@
 //!
 //! This file does nothing that a [`Rig`] implementation could not do.
 
-use super::{BodyInfo, Context, Estimate, FleetTruth, Measurement, Monitor, NoFleet, Picture, Rig, Truth, graphs};
+use super::{
+    BodyInfo, Command, Context, Estimate, FleetTruth, Measurement, Monitor, NoFleet, Picture, Rig, Truth, graphs,
+};
 use crate::config::{Checks, ConfigError, Document, InputInfo, keys_of};
 use crate::input::COMPONENTS_MAX;
 use crate::role::{Body, Estimator, Guard, Law, REFERENCE_MAX, Refusal, SingleBody};
@@ -187,9 +189,9 @@ pub trait SimpleRig: Serialize + DeserializeOwned + Clone + Send + Sync + 'stati
     fn monitors() -> &'static [Monitor<Self>] {
         &[]
     }
-    /// Returns the pictures of the motion in a report; by default every number of the truth over time.
+    /// Returns the pictures of the motion in a report; by default every number of the truth over time, and the commands.
     fn pictures() -> Vec<Picture> {
-        graphs::<Truth<Self>>()
+        graphs::<Truth<Self>, Measurement<Self>, Command<Self>>()
     }
 }
 

@@ -25,6 +25,7 @@ use super::{
     BodyInfo, CertificateReport, ConditionReport, Context, Figure, Graph, Inputs, Lyapunov, Monitor, Picture, Plane,
     Rig, Start, Watched,
 };
+use crate::bus::Signal;
 use crate::config::{Checks, ConfigError, Document, InputInfo};
 use crate::control::{Certificate, Synchronizer};
 use crate::model::{Inertia, Noise, RigidBody};
@@ -451,8 +452,12 @@ impl Rig for RigidBodyRig {
                 caption: format!("The coefficient a{axis} of [D](2) as the observer learns it."),
             })
         };
-        let inputs =
-            Inputs { field: "applied_rad_s2", axis: "control acceleration, rad/s²", components: &["u1", "u2", "u3"] };
+        let inputs = Inputs {
+            field: "acceleration_rad_s2",
+            applied: (Signal::Truth, "applied_rad_s2"),
+            axis: "control acceleration, rad/s²".to_owned(),
+            components: ["u1", "u2", "u3"].map(str::to_owned).to_vec(),
+        };
         vec![
             plane("angular velocities in the plane ω1 ω2", ["ω1, rad/s", "ω2, rad/s"], |element| {
                 Some([element("omega_rad_s", 0)?, element("omega_rad_s", 1)?])
