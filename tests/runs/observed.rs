@@ -11,7 +11,7 @@ use std::sync::OnceLock;
 const RATE_PER_S: f64 = 1.724_616;
 const OBSERVERS: [&str; 2] = ["observer", "observer-follower"];
 
-fn program() -> &'static Path {
+pub(super) fn program() -> &'static Path {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
     PROGRAM.get_or_init(|| {
         built("carts", include_str!("../data/carts.rs"), ("carts.toml", include_str!("../data/carts.toml")))
