@@ -1,10 +1,9 @@
 //! Instructions per estimate-and-control step and per tick of a run in one thread, counted by callgrind: detects
 //! regressions on noisy machines too.
 //!
-//! `cargo bench --features hooks,foxglove,parquet,hosts --bench instructions` (the features of the tests: others
-//! change inlining) compares with `benches/instructions.json` and fails beyond its tolerance; `-- --save` updates the
-//! file. Needs valgrind. The figures belong to one compiler, see `compiler` in the file: with another one they are
-//! shown and not compared.
+//! `cargo bench --bench instructions` compares with `benches/instructions.json` and fails beyond its tolerance; `-- --save` updates the
+//! file. With other features inlining may differ. Needs valgrind. The figures belong to one compiler, see `compiler` in the file: with
+//! another one they are shown and not compared.
 
 #[path = "contest/product.rs"]
 #[allow(dead_code, reason = "the contest uses all of it")]
