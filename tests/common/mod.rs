@@ -3,10 +3,12 @@
 #![allow(dead_code, reason = "some features exclude the tests that use an item")]
 
 mod bench;
+mod in_thread;
 mod process;
 mod recording;
 
 pub use bench::Bench;
+pub use in_thread::{Loop, next};
 pub use process::{Done, Running, WATCHDOG, await_some, catches, code_of, processes_marked, send_signal, status_of};
 pub use recording::{rewrite, rewrite_metadata};
 

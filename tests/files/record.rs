@@ -1,13 +1,13 @@
 //! Recordings, read by independent programs and compared with what was published; replayed; cut off.
 
-use crate::common::{Bench, Done, await_some, python, rewrite, rewrite_metadata, root, send_signal, shipped, skipped};
+use crate::common::{
+    Bench, Done, Loop, await_some, python, rewrite, rewrite_metadata, root, send_signal, shipped, skipped,
+};
 use corotate::bus::Reader;
 use corotate::bus::memory::MemoryBus;
 use corotate::clock::{Grid, monotonic_ns};
 use corotate::record::{Recorder, Recording, RoleReplay, replay_in_process};
-use corotate::runtime::{
-    Poll, ReadyNode, RoleId, RunCondition, depths, drive_in_turn, ports, private_ledger, report, shared_ledger,
-};
+use corotate::runtime::{Poll, ReadyNode, RoleId, RunCondition, depths, ports, report, shared_ledger};
 use corotate::sample::topic_of;
 use corotate::scenario::Scenario;
 use corotate::scenario::build;
@@ -40,30 +40,21 @@ fn replay_difference(bench: &Bench, file: &Path, options: &[&str]) -> Value {
 
 /// Runs a scenario in this thread without a recorder, and returns all published bytes by service.
 fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
-    let bus = MemoryBus::new(depths(scenario));
-    let roles = RoleId::all(scenario);
-    let writes = roles.iter().flat_map(|role| ports(scenario, *role).writes);
+    let mut all = Loop::open(scenario);
+    let writes = RoleId::all(scenario).into_iter().flat_map(|role| ports(scenario, role).writes);
     let mut taps: Vec<_> =
-        writes.map(|port| (port.topic.to_string(), port.reader(&bus, Reader::Scorer).unwrap())).collect();
-    let mut all: BTreeMap<String, Vec<u8>> = BTreeMap::new();
-    let node = |role: &RoleId| {
-        let ledger = private_ledger(scenario, *role);
-        build(scenario, *role, &bus, &ledger).unwrap()
-    };
-    let mut nodes: Vec<_> = roles.iter().map(node).collect();
-    let none = |_| panic!("no role dies here");
+        writes.map(|port| (port.topic.to_string(), port.reader(&all.bus, Reader::Scorer).unwrap())).collect();
+    let mut published: BTreeMap<String, Vec<u8>> = BTreeMap::new();
     let grid = Grid { epoch_ns: 0, period_ns: scenario.period_ns };
-    nodes.iter_mut().for_each(|node| node.start(grid, 0).unwrap());
-    drive_in_turn(&mut nodes, scenario.last_tick, none, |_| {
+    all.nodes.iter_mut().for_each(|node| node.start(grid, 0).unwrap());
+    all.run(|_| {
         for (service, reader) in &mut taps {
             while let Some(words) = reader.next().unwrap() {
-                all.entry(service.clone()).or_default().extend_from_slice(bytemuck::cast_slice(words));
+                published.entry(service.clone()).or_default().extend_from_slice(bytemuck::cast_slice(words));
             }
         }
-        true
-    })
-    .unwrap();
-    all
+    });
+    published
 }
 
 #[test]

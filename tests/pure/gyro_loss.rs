@@ -1,13 +1,10 @@
 //! A gyro axis fails in flight: the estimate does not jump, the follower stays synchronised, the axis may return, and
 //! an axis that fails too early is flagged and bounded.
 
-use crate::common::shipped;
-use corotate::bus::memory::MemoryBus;
-use corotate::bus::{Reader, Signal};
-use corotate::runtime::{Input, RoleId, depths, drive_in_turn, private_ledger, topic};
+use crate::common::{Loop, next, shipped};
+use corotate::bus::Signal;
 use corotate::sample::{RateEstimate, RateTruth, status};
 use corotate::scenario::Scenario;
-use corotate::scenario::build;
 
 /// The samples of one tick.
 struct Row {
@@ -39,33 +36,15 @@ fn distance(a: &[f64; 3], b: &[f64; 3]) -> f64 {
 fn rows(overrides: &[&str]) -> Vec<Row> {
     let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
     let scenario = Scenario::load(&shipped("gyro-loss"), &overrides).unwrap();
-    let bus = MemoryBus::new(depths(&scenario));
-    let mut nodes: Vec<_> = RoleId::all(&scenario)
-        .into_iter()
-        .map(|role| build(&scenario, role, &bus, &private_ledger(&scenario, role)).unwrap())
-        .collect();
-    let truth = |body: &str| -> Input<MemoryBus, RateTruth> {
-        Input::open(&bus, &topic(&scenario, body, Signal::Truth), Reader::Scorer).unwrap()
-    };
-    let (mut leader, mut follower) = (truth("leader"), truth("follower"));
-    let mut estimate: Input<MemoryBus, RateEstimate> =
-        Input::open(&bus, &topic(&scenario, "leader", Signal::Estimate), Reader::Scorer).unwrap();
+    let mut all = Loop::open(&scenario);
+    let (mut leader, mut follower) =
+        (all.input::<RateTruth>("leader", Signal::Truth), all.input::<RateTruth>("follower", Signal::Truth));
+    let mut estimate = all.input::<RateEstimate>("leader", Signal::Estimate);
     let mut rows = Vec::new();
-    drive_in_turn(
-        &mut nodes,
-        scenario.last_tick,
-        |_| Ok(None),
-        |_| {
-            assert!(leader.advance().unwrap() && follower.advance().unwrap() && estimate.advance().unwrap());
-            rows.push(Row {
-                leader: leader.sample().unwrap().omega_rad_s,
-                follower: follower.sample().unwrap().omega_rad_s,
-                estimate: *estimate.sample().unwrap(),
-            });
-            true
-        },
-    )
-    .unwrap();
+    all.run(|_| {
+        let (leader, follower) = (next(&mut leader).omega_rad_s, next(&mut follower).omega_rad_s);
+        rows.push(Row { leader, follower, estimate: next(&mut estimate) });
+    });
     rows
 }
 

@@ -1,16 +1,13 @@
 //! Checks the third paper's system: the motion against an independent reference, the observer's floor, decay and
 //! order, the loop with and without a measured velocity, the clocks against each other, faults, and invalid input.
 
-use crate::common::{Bench, WITHOUT_TICK_LIMITS, cases, reference, shipped};
-use corotate::bus::memory::MemoryBus;
-use corotate::bus::{Reader, Signal};
+use crate::common::{Bench, Loop, WITHOUT_TICK_LIMITS, cases, next, reference, shipped};
+use corotate::bus::Signal;
 use corotate::control::{OrbitGains, OrbitHold};
 use corotate::model::{CentralField, OrbitState};
 use corotate::observe::{InvariantFilter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
-use corotate::runtime::{Input, RoleId, depths, drive_in_turn, private_ledger, topic};
 use corotate::sample::{OrbitEstimate, OrbitTruth};
 use corotate::scenario::Scenario;
-use corotate::scenario::build;
 use nalgebra::{Vector2, Vector4};
 use proptest::prelude::*;
 use serde_json::Value;
@@ -141,35 +138,12 @@ fn the_error_is_of_fourth_order_in_the_tick() {
 fn run(name: &str, overrides: &[&str]) -> Vec<(Vec<OrbitTruth>, OrbitEstimate)> {
     let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
     let scenario = &Scenario::load(&shipped(name), &overrides).unwrap();
-    let bus = MemoryBus::new(depths(scenario));
-    let mut nodes: Vec<_> = RoleId::all(scenario)
-        .into_iter()
-        .map(|role| build(scenario, role, &bus, &private_ledger(scenario, role)).unwrap())
-        .collect();
+    let mut all = Loop::open(scenario);
     let bodies = scenario.rig.bodies();
-    let mut truths: Vec<Input<MemoryBus, OrbitTruth>> = bodies
-        .iter()
-        .map(|body| Input::open(&bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer).unwrap())
-        .collect();
-    let mut estimate: Input<MemoryBus, OrbitEstimate> =
-        Input::open(&bus, &topic(scenario, &bodies[0].name, Signal::Estimate), Reader::Scorer).unwrap();
+    let mut truths: Vec<_> = bodies.iter().map(|body| all.input::<OrbitTruth>(&body.name, Signal::Truth)).collect();
+    let mut estimate = all.input::<OrbitEstimate>(&bodies[0].name, Signal::Estimate);
     let mut rows = Vec::new();
-    drive_in_turn(
-        &mut nodes,
-        scenario.last_tick,
-        |_| Ok(None),
-        |_| {
-            let mut take = |truth: &mut Input<MemoryBus, OrbitTruth>| {
-                assert!(truth.advance().unwrap());
-                *truth.sample().unwrap()
-            };
-            let truths = truths.iter_mut().map(&mut take).collect();
-            assert!(estimate.advance().unwrap());
-            rows.push((truths, *estimate.sample().unwrap()));
-            true
-        },
-    )
-    .unwrap();
+    all.run(|_| rows.push((truths.iter_mut().map(next).collect(), next(&mut estimate))));
     rows
 }
 

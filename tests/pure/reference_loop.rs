@@ -1,12 +1,9 @@
 //! The closed loop against an implementation that shares no code with it, and the three clocks against each other.
 
-use crate::common::{Bench, reference, shipped};
-use corotate::bus::memory::MemoryBus;
-use corotate::bus::{Reader, Signal};
-use corotate::runtime::{Input, RoleId, depths, drive_in_turn, private_ledger, topic};
+use crate::common::{Bench, Loop, next, reference, shipped};
+use corotate::bus::Signal;
 use corotate::sample::{RateEstimate, RateTruth};
 use corotate::scenario::Scenario;
-use corotate::scenario::build;
 use serde_json::Value;
 
 /// The tolerance of the columns of `let_pair*.csv`.
@@ -30,32 +27,17 @@ fn case(file: &str) -> (&'static str, Vec<String>) {
 
 /// Runs a scenario in this thread and returns ω, p, ω̂3 and u per tick, like the reference.
 pub(super) fn columns(scenario: &Scenario) -> Vec<Vec<f64>> {
-    let bus = MemoryBus::new(depths(scenario));
-    let mut nodes: Vec<_> = RoleId::all(scenario)
-        .into_iter()
-        .map(|role| build(scenario, role, &bus, &private_ledger(scenario, role)).unwrap())
-        .collect();
-    let truth = |body: &str| -> Input<MemoryBus, RateTruth> {
-        Input::open(&bus, &topic(scenario, body, Signal::Truth), Reader::Scorer).unwrap()
-    };
-    let (mut leader, mut follower) = (truth("leader"), truth("follower"));
-    let mut estimate: Input<MemoryBus, RateEstimate> =
-        Input::open(&bus, &topic(scenario, "leader", Signal::Estimate), Reader::Scorer).unwrap();
+    let mut all = Loop::open(scenario);
+    let (mut leader, mut follower) =
+        (all.input::<RateTruth>("leader", Signal::Truth), all.input::<RateTruth>("follower", Signal::Truth));
+    let mut estimate = all.input::<RateEstimate>("leader", Signal::Estimate);
     let mut rows = Vec::new();
-    drive_in_turn(
-        &mut nodes,
-        scenario.last_tick,
-        |_| Ok(None),
-        |tick| {
-            assert!(leader.advance().unwrap() && follower.advance().unwrap() && estimate.advance().unwrap());
-            let (leader, follower) = (leader.sample().unwrap(), follower.sample().unwrap());
-            let hidden = estimate.sample().unwrap().omega_rad_s[2];
-            let row = [&leader.omega_rad_s[..], &follower.omega_rad_s, &[hidden], &follower.applied_rad_s2].concat();
-            rows.push([&[tick as f64, scenario.time_s(tick)][..], &row].concat());
-            true
-        },
-    )
-    .unwrap();
+    all.run(|tick| {
+        let (leader, follower) = (next(&mut leader), next(&mut follower));
+        let hidden = next(&mut estimate).omega_rad_s[2];
+        let row = [&leader.omega_rad_s[..], &follower.omega_rad_s, &[hidden], &follower.applied_rad_s2].concat();
+        rows.push([&[tick as f64, scenario.time_s(tick)][..], &row].concat());
+    });
     rows
 }
 

@@ -6,15 +6,14 @@
 //! `tests/claims-campaign N SEED FIRST` draws N scenarios from number FIRST on; the short form in the suite is the first 60
 //! of seed 1.
 
+use crate::common::Loop;
 use corotate::analysis::Claim;
-use corotate::bus::memory::MemoryBus;
-use corotate::bus::{Reader, Signal};
+use corotate::bus::Signal;
 use corotate::config::SHIPPED;
 use corotate::rig::{Estimate, Rig, Truth};
-use corotate::runtime::{Input, RoleId, depths, drive_in_turn, private_ledger, report, topic};
+use corotate::runtime::report;
 use corotate::sample::{FieldKind, Sample};
 use corotate::scenario::Scenario;
-use corotate::scenario::build;
 use corotate::scenario::claims;
 use corotate::with_shipped_rig;
 use rand_pcg::Pcg64;
@@ -228,23 +227,16 @@ struct Trace {
 
 fn run(scenario: &Scenario) -> Trace {
     fn typed<R: Rig>(rig: &R, scenario: &Scenario) -> Trace {
-        let bus = MemoryBus::new(depths(scenario));
-        let roles: Vec<_> =
-            RoleId::all(scenario).into_iter().map(|role| (role, private_ledger(scenario, role))).collect();
-        let mut nodes: Vec<_> =
-            roles.iter().map(|(role, ledger)| build(scenario, *role, &bus, ledger).unwrap()).collect();
+        let mut all = Loop::open(scenario);
         let bodies = rig.bodies();
-        let mut truths: Vec<Input<MemoryBus, Truth<R>>> = (bodies.iter())
-            .map(|body| Input::open(&bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer).unwrap())
-            .collect();
-        let mut estimate: Input<MemoryBus, Estimate<R>> =
-            Input::open(&bus, &topic(scenario, &bodies[0].name, Signal::Estimate), Reader::Scorer).unwrap();
+        let mut truths: Vec<_> = bodies.iter().map(|body| all.input::<Truth<R>>(&body.name, Signal::Truth)).collect();
+        let mut estimate = all.input::<Estimate<R>>(&bodies[0].name, Signal::Estimate);
         let numbers: Vec<_> = Truth::<R>::FIELDS
             .iter()
             .filter(|field| field.kind == FieldKind::F64 && R::controlled().contains(&field.name))
             .collect();
         let (mut errors, mut motion) = (Vec::new(), Vec::new());
-        let each = |_: u64| {
+        all.run(|_| {
             truths.iter_mut().for_each(|truth| assert!(truth.advance().unwrap()));
             estimate.advance().unwrap();
             let mut values = vec![0.0; rig.metrics().len()];
@@ -253,10 +245,9 @@ fn run(scenario: &Scenario) -> Trace {
             let words = corotate::sample::Message::words(truths[0].sample().unwrap());
             let components = |field: &&corotate::sample::Field| words[field.offset / 8..][..field.count].to_vec();
             motion.push(numbers.iter().flat_map(components).map(f64::from_bits).collect());
-            true
-        };
-        drive_in_turn(&mut nodes, scenario.last_tick, |_| Ok(None), each).unwrap();
-        let read = roles.iter().flat_map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new()).read);
+        });
+        let read =
+            all.roles.iter().flat_map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new()).read);
         let rejected = read.map(|link| link.rejected).sum();
         Trace { tick_s: scenario.tick_s(), errors, motion, rejected }
     }

@@ -1,13 +1,11 @@
 //! Fleets: many followers in one process. Each body moves as it does alone, under every clock; a fault affects the whole
 //! fleet at once.
 
-use crate::common::{ANY_TICKS, Bench, await_some, send_signal, shipped};
-use corotate::bus::memory::MemoryBus;
-use corotate::bus::{Carried, Reader, Signal};
-use corotate::runtime::{Input, RoleId, depths, drive_in_turn, private_ledger, topic, window_ticks};
+use crate::common::{ANY_TICKS, Bench, Loop, await_some, send_signal, shipped};
+use corotate::bus::{Carried, Signal};
+use corotate::runtime::window_ticks;
 use corotate::sample::{FleetTruth, RateTruth};
 use corotate::scenario::Scenario;
-use corotate::scenario::build;
 use libc::SIGKILL;
 use serde_json::Value;
 
@@ -15,32 +13,23 @@ use serde_json::Value;
 type Motion = Vec<([f64; 3], [f64; 3])>;
 
 /// Runs a scenario in this thread and passes every true state of its follower to `look`.
-fn watch<S: Carried + ?Sized>(name: &str, overrides: &[String], bodies: usize, mut look: impl FnMut(&S)) {
+fn watch<S: Carried + ?Sized>(name: &str, overrides: &[String], mut look: impl FnMut(&S)) {
     let common =
         ["accept={}", "limits={rate_rad_s=10.0, acceleration_rad_s2=3.0}", "duration_s=2.0", "clock=in-process"];
     let overrides: Vec<String> = common.iter().map(|text| (*text).to_owned()).chain(overrides.to_vec()).collect();
     let scenario = Scenario::load(&shipped(name), &overrides).unwrap();
-    let bus = MemoryBus::new(depths(&scenario));
-    let node = |role| {
-        let ledger = private_ledger(&scenario, role);
-        build(&scenario, role, &bus, &ledger).unwrap()
-    };
-    let mut nodes: Vec<_> = RoleId::all(&scenario).into_iter().map(node).collect();
-    let body = &scenario.rig.bodies()[1].name;
-    let mut truth: Input<MemoryBus, S> =
-        Input::open_many(&bus, &topic(&scenario, body, Signal::Truth), bodies, Reader::Scorer).unwrap();
-    let each = |_| {
+    let mut all = Loop::open(&scenario);
+    let mut truth = all.input::<S>(&scenario.rig.bodies()[1].name, Signal::Truth);
+    all.run(|_| {
         assert!(truth.advance().unwrap());
         look(truth.sample().unwrap());
-        true
-    };
-    drive_in_turn(&mut nodes, scenario.last_tick, |_| Ok(None), each).unwrap();
+    });
 }
 
 fn alone(rate: [f64; 3], overrides: &[String]) -> Motion {
     let mut motion = Motion::new();
     let start = format!("follower.0.initial_rate_rad_s={rate:?}");
-    watch::<RateTruth>("rigid-pair", &[overrides, &[start]].concat(), 1, |truth| {
+    watch::<RateTruth>("rigid-pair", &[overrides, &[start]].concat(), |truth| {
         motion.push((truth.omega_rad_s, truth.applied_rad_s2));
     });
     motion
@@ -49,7 +38,7 @@ fn alone(rate: [f64; 3], overrides: &[String]) -> Motion {
 fn fleet(count: usize, overrides: &[String]) -> Vec<Motion> {
     let mut motions = vec![Motion::new(); count];
     let many = [format!("follower.0.count={count}"), "follower.0.initial_rate_spread_rad_s=[2.0, 2.0, 2.0]".to_owned()];
-    watch::<FleetTruth>("rigid-pair", &[overrides, &many].concat(), count, |truth| {
+    watch::<FleetTruth>("rigid-pair", &[overrides, &many].concat(), |truth| {
         for (body, motion) in motions.iter_mut().enumerate() {
             motion.push((truth.vector(0).map(|rates| rates[body]), truth.vector(1).map(|applied| applied[body])));
         }

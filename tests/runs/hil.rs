@@ -1,7 +1,7 @@
 //! Hardware in the loop: the foreign follower tests/hil/follower.py with corotate's leader, observer and controller. Verdicts are
 //! read from the JUnit file, as a CI does.
 
-use crate::common::{Bench, Done, Running, await_some, python, root};
+use crate::common::{Bench, Done, Loop, Running, await_some, next, python, root};
 use corotate::bus::domain::{Domain, OwnedDomain};
 use corotate::bus::iox::IoxBus;
 use corotate::bus::memory::MemoryBus;
@@ -9,7 +9,7 @@ use corotate::bus::{Bus, Read, Reader, Signal, Write};
 use corotate::clock::monotonic_ns;
 use corotate::config::ClockKind;
 use corotate::inputs::{Answer, InputError, Request, WantedChange, request};
-use corotate::runtime::{Input, Poll, RoleId, RunCondition, Seek, depths, drive_in_turn, private_ledger, topic};
+use corotate::runtime::{Input, Poll, RoleId, RunCondition, Seek, depths, private_ledger, topic};
 use corotate::sample::{
     FieldKind, Health, NO_SAMPLE, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, status,
 };
@@ -131,38 +131,17 @@ fn in_lockstep_all_samples_equal_those_of_the_built_in_follower() {
 fn built_in() -> (Vec<RateMeasurement>, Vec<RateTruth>, Vec<RateCommand>) {
     let overrides = ["launch.external=[]", "clock=in-process"].map(str::to_owned);
     let scenario = Scenario::load(&file("pair.toml"), &overrides).unwrap();
-    let bus = MemoryBus::new(depths(&scenario));
-    let node = |role: RoleId| {
-        let ledger = private_ledger(&scenario, role);
-        build(&scenario, role, &bus, &ledger).unwrap()
-    };
-    let mut nodes: Vec<_> = RoleId::all(&scenario).into_iter().map(node).collect();
-    let mut measurement = reader(&bus, &scenario, Signal::Measurement);
-    let mut truth = reader(&bus, &scenario, Signal::Truth);
-    let mut command = reader(&bus, &scenario, Signal::Command);
+    let mut all = Loop::open(&scenario);
+    let mut measurement = all.input("follower", Signal::Measurement);
+    let mut truth = all.input("follower", Signal::Truth);
+    let mut command = all.input("follower", Signal::Command);
     let mut seen = (Vec::new(), Vec::new(), Vec::new());
-    drive_in_turn(
-        &mut nodes,
-        scenario.last_tick,
-        |_| Ok(None),
-        |_| {
-            seen.0.push(next(&mut measurement));
-            seen.1.push(next(&mut truth));
-            seen.2.push(next(&mut command));
-            true
-        },
-    )
-    .unwrap();
+    all.run(|_| {
+        seen.0.push(next(&mut measurement));
+        seen.1.push(next(&mut truth));
+        seen.2.push(next(&mut command));
+    });
     seen
-}
-
-fn reader<S: Sample>(bus: &MemoryBus, scenario: &Scenario, signal: Signal) -> Input<MemoryBus, S> {
-    Input::open(bus, &topic(scenario, "follower", signal), Reader::Scorer).unwrap()
-}
-
-fn next<S: Sample>(input: &mut Input<MemoryBus, S>) -> S {
-    assert!(input.advance().unwrap());
-    *input.sample().unwrap()
 }
 
 /// Reads the samples of a signal that the foreign follower wrote.
@@ -224,7 +203,8 @@ fn built_in_under_commands(scenario: &Scenario) -> Vec<RateTruth> {
     let follower = RoleId::named(scenario, "follower").unwrap();
     let ledger = private_ledger(scenario, follower);
     let mut node = build(scenario, follower, &bus, &ledger).unwrap();
-    let mut truth = reader::<RateTruth>(&bus, scenario, Signal::Truth);
+    let truth = topic(scenario, "follower", Signal::Truth);
+    let mut truth = Input::<MemoryBus, RateTruth>::open(&bus, &truth, Reader::Scorer).unwrap();
     let mut writer = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command), 1).unwrap();
     let mut seen = Vec::new();
     for tick in 0..=LED_TICKS {
