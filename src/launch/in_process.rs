@@ -41,20 +41,7 @@ fn run_directly(scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome>
     };
     let (reports, score) = scenario.rig.direct(scenario, checkpoints, &mut go_on)?;
     let signal = if stopped { launch.signal.load(Ordering::Relaxed) } else { 0 };
-    Some(Outcome {
-        late: None,
-        reports,
-        recording: None,
-        unbooked: Vec::new(),
-        problems: Vec::new(),
-        score,
-        incidents: Vec::new(),
-        hosts: Vec::new(),
-        grants: Vec::new(),
-        domain: None,
-        remains: None,
-        signal,
-    })
+    Some(Outcome { signal, ..Outcome::in_one_thread(reports, score) })
 }
 
 /// Runs all roles over links.
@@ -128,20 +115,8 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
         let last = if unrecorded.is_none() { recorder.poll().err() } else { unrecorded };
         recorder.finish(&reports, last.as_ref())
     });
-    Ok(Outcome {
-        late: None,
-        reports,
-        recording,
-        unbooked: Vec::new(),
-        problems: Vec::new(),
-        score,
-        incidents,
-        hosts: Vec::new(),
-        grants: Vec::new(),
-        domain: None,
-        remains: None,
-        signal: if ended == Ended::Stopped { launch.signal.load(Ordering::Relaxed) } else { 0 },
-    })
+    let signal = if ended == Ended::Stopped { launch.signal.load(Ordering::Relaxed) } else { 0 };
+    Ok(Outcome { recording, incidents, signal, ..Outcome::in_one_thread(reports, score) })
 }
 
 /// Reacts to a role that the scenario killed, by the same policy as for processes.

@@ -46,6 +46,26 @@ pub struct Outcome {
     pub(super) remains: Option<Remains>,
 }
 
+impl Outcome {
+    /// Creates the outcome of a run in one thread without incidents: it has no processes and no files.
+    pub(super) fn in_one_thread(reports: Vec<RoleReport>, score: Score) -> Self {
+        Self {
+            reports,
+            unbooked: Vec::new(),
+            problems: Vec::new(),
+            score,
+            incidents: Vec::new(),
+            hosts: Vec::new(),
+            grants: Vec::new(),
+            recording: None,
+            late: None,
+            domain: None,
+            signal: 0,
+            remains: None,
+        }
+    }
+}
+
 /// The counters of a run.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct Accounting {

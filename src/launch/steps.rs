@@ -405,20 +405,7 @@ impl Steps {
         let score = self.scorer.finish()?;
         let role_report =
             |(role, ledger): &(RoleId, Ledger)| report(&self.scenario, *role, ledger, Vec::new(), Vec::new());
-        Ok(Outcome {
-            late: None,
-            reports: self.seats.iter().map(role_report).collect(),
-            recording: None,
-            unbooked: Vec::new(),
-            problems: Vec::new(),
-            score,
-            incidents: Vec::new(),
-            hosts: Vec::new(),
-            grants: Vec::new(),
-            domain: None,
-            remains: None,
-            signal: 0,
-        })
+        Ok(Outcome::in_one_thread(self.seats.iter().map(role_report).collect(), score))
     }
 }
 
