@@ -12,14 +12,10 @@ const GRANTED_US: u32 = 900_000;
 /// Returns the budget files with value zero of this process's cgroup and its parents, outermost first. Empty where the
 /// kernel keeps no such budgets. `root` is the root of the machine's files.
 pub fn empty_budgets(root: &Path) -> Vec<PathBuf> {
-    let read = |path: &str| fs::read_to_string(root.join(path)).unwrap_or_default();
-    find(&read("proc/self/cgroup"), &read("proc/self/mountinfo"))
-        .into_iter()
-        .filter(|path| {
-            let below = path.strip_prefix("/").unwrap_or(path);
-            fs::read_to_string(root.join(below)).is_ok_and(|text| text.trim() == "0")
-        })
-        .collect()
+    let cgroups = Cgroups::new(root);
+    // Version 2 has no budgets.
+    let files = cgroups.with("cpu").into_iter().map(|group| group.join("cpu.rt_runtime_us"));
+    files.filter(|file| cgroups.read(file).is_some_and(|text| text.trim() == "0")).collect()
 }
 
 /// Returns the shell commands that grant a budget in each file.
@@ -41,17 +37,15 @@ pub struct CpuQuota {
 
 /// Returns the tightest limit on processor time of this process's cgroup and its parents (version 1 or 2), if there is one.
 pub fn cpu_quota(root: &Path) -> Option<CpuQuota> {
-    let read = |path: &Path| fs::read_to_string(root.join(path.strip_prefix("/").unwrap_or(path))).ok();
-    let [cgroups, mounts] =
-        ["/proc/self/cgroup", "/proc/self/mountinfo"].map(|path| read(Path::new(path)).unwrap_or_default());
-    let number = |path: &Path| read(path)?.trim().parse::<u64>().ok();
-    let old = cpu_groups(&cgroups, &mounts).into_iter().filter_map(|group| {
+    let cgroups = Cgroups::new(root);
+    let number = |path: &Path| cgroups.read(path)?.trim().parse::<u64>().ok();
+    let old = cgroups.with("cpu").into_iter().filter_map(|group| {
         let file = group.join("cpu.cfs_quota_us");
         Some(CpuQuota { quota_us: number(&file)?, period_us: number(&group.join("cpu.cfs_period_us"))?, file })
     });
-    let unified = unified_groups(&cgroups, &mounts).into_iter().filter_map(|group| {
+    let unified = cgroups.unified().into_iter().filter_map(|group| {
         let file = group.join("cpu.max");
-        let text = read(&file)?;
+        let text = cgroups.read(&file)?;
         let mut numbers = text.split_whitespace().map(|word| word.parse().ok());
         Some(CpuQuota { quota_us: numbers.next()??, period_us: numbers.next()??, file })
     });
@@ -73,73 +67,78 @@ pub struct CpuSetLimit {
 /// Returns the set of cores of this process's cgroup (version 1 or 2), with the file of the outermost group that has the same set;
 /// `None` without such a controller.
 pub fn cpu_set(root: &Path) -> Option<CpuSetLimit> {
-    let read = |path: &Path| fs::read_to_string(root.join(path.strip_prefix("/").unwrap_or(path))).ok();
-    let [cgroups, mounts] =
-        ["/proc/self/cgroup", "/proc/self/mountinfo"].map(|path| read(Path::new(path)).unwrap_or_default());
-    let has_cpuset = |list: &str| list.split(',').any(|name| name == "cpuset");
-    let old = groups(&cgroups, &mounts, has_cpuset, |kind, options| kind == "cgroup" && has_cpuset(options));
+    let cgroups = Cgroups::new(root);
     let limits = |groups: Vec<PathBuf>, files: &[&str]| -> Vec<CpuSetLimit> {
         let cores = |group: &Path| {
-            let texts = files.iter().filter_map(|file| read(&group.join(file)));
+            let texts = files.iter().filter_map(|file| cgroups.read(&group.join(file)));
             texts.map(|text| text.trim().to_owned()).find(|text| !text.is_empty())
         };
         let limit = |group: PathBuf| Some(CpuSetLimit { cores: cores(&group)?, file: group.join("cpuset.cpus") });
         groups.into_iter().filter_map(limit).collect()
     };
     // Older kernels have no effective set in version 1.
-    let old = limits(old, &["cpuset.effective_cpus", "cpuset.cpus"]);
-    let unified = limits(unified_groups(&cgroups, &mounts), &["cpuset.cpus.effective"]);
+    let old = limits(cgroups.with("cpuset"), &["cpuset.effective_cpus", "cpuset.cpus"]);
+    let unified = limits(cgroups.unified(), &["cpuset.cpus.effective"]);
     // A kernel has the controller in one of the two versions.
     let limits = if old.is_empty() { unified } else { old };
     let own = limits.last()?.cores.clone();
     limits.into_iter().find(|limit| limit.cores == own)
 }
 
-/// Returns the budget files of the cgroups of controller `cpu` (version 1), outermost first. Version 2 has no budgets.
-fn find(cgroups: &str, mounts: &str) -> Vec<PathBuf> {
-    cpu_groups(cgroups, mounts).into_iter().map(|group| group.join("cpu.rt_runtime_us")).collect()
+/// The cgroups of this process.
+struct Cgroups<'a> {
+    root: &'a Path,
+    cgroups: String,
+    mounts: String,
 }
 
-/// Returns the directories of the cgroups of controller `cpu` (version 1), outermost first.
-fn cpu_groups(cgroups: &str, mounts: &str) -> Vec<PathBuf> {
-    let has_cpu = |list: &str| list.split(',').any(|name| name == "cpu");
-    groups(cgroups, mounts, has_cpu, |kind, options| kind == "cgroup" && has_cpu(options))
-}
-
-/// Returns the directories of the cgroups of version 2, outermost first.
-fn unified_groups(cgroups: &str, mounts: &str) -> Vec<PathBuf> {
-    groups(cgroups, mounts, str::is_empty, |kind, _| kind == "cgroup2")
-}
-
-/// Returns the directories of this process's cgroup and its parents, outermost first, by the controllers of its line and by the
-/// type and options of its mount.
-fn groups(
-    cgroups: &str,
-    mounts: &str,
-    is_group: impl Fn(&str) -> bool,
-    is_mount: impl Fn(&str, &str) -> bool,
-) -> Vec<PathBuf> {
-    // "1:cpu,cpuacct:/path"
-    let path = cgroups.lines().find_map(|line| {
-        let (controllers, path) = line.split_once(':')?.1.split_once(':')?;
-        is_group(controllers).then_some(path)
-    });
-    // "32 31 0:29 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu"
-    let mount = mounts.lines().find_map(|line| {
-        let (before, after) = line.split_once(" - ")?;
-        let (mut before, mut after) = (before.split(' ').skip(3), after.split(' '));
-        let (kind, options) = (after.next()?, after.nth(1)?);
-        is_mount(kind, options).then_some((before.next()?, before.next()?))
-    });
-    let (Some(path), Some((top, mounted))) = (path, mount) else { return Vec::new() };
-    // Groups above the mounted one cannot be read.
-    let Ok(below) = Path::new(path).strip_prefix(top) else { return Vec::new() };
-    if below.components().any(|part| part == Component::ParentDir) {
-        return Vec::new();
+impl<'a> Cgroups<'a> {
+    fn new(root: &'a Path) -> Self {
+        let text = |path| fs::read_to_string(root.join(path)).unwrap_or_default();
+        Self { root, cgroups: text("proc/self/cgroup"), mounts: text("proc/self/mountinfo") }
     }
-    let mut groups: Vec<&Path> = below.ancestors().collect();
-    groups.reverse();
-    groups.into_iter().map(|group| Path::new(mounted).join(group)).collect()
+
+    /// Returns the text of a file of the machine.
+    fn read(&self, path: &Path) -> Option<String> {
+        fs::read_to_string(self.root.join(path.strip_prefix("/").unwrap_or(path))).ok()
+    }
+
+    /// Returns the directories with a controller of version 1, outermost first.
+    fn with(&self, controller: &str) -> Vec<PathBuf> {
+        let has = |list: &str| list.split(',').any(|name| name == controller);
+        self.groups(has, |kind, options| kind == "cgroup" && has(options))
+    }
+
+    /// Returns the directories of version 2, outermost first.
+    fn unified(&self) -> Vec<PathBuf> {
+        self.groups(str::is_empty, |kind, _| kind == "cgroup2")
+    }
+
+    /// Returns the directories of this process's cgroup and its parents, outermost first, by the controllers of its line and by the
+    /// type and options of its mount.
+    fn groups(&self, is_group: impl Fn(&str) -> bool, is_mount: impl Fn(&str, &str) -> bool) -> Vec<PathBuf> {
+        // "1:cpu,cpuacct:/path"
+        let path = self.cgroups.lines().find_map(|line| {
+            let (controllers, path) = line.split_once(':')?.1.split_once(':')?;
+            is_group(controllers).then_some(path)
+        });
+        // "32 31 0:29 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu"
+        let mount = self.mounts.lines().find_map(|line| {
+            let (before, after) = line.split_once(" - ")?;
+            let (mut before, mut after) = (before.split(' ').skip(3), after.split(' '));
+            let (kind, options) = (after.next()?, after.nth(1)?);
+            is_mount(kind, options).then_some((before.next()?, before.next()?))
+        });
+        let (Some(path), Some((top, mounted))) = (path, mount) else { return Vec::new() };
+        // Groups above the mounted one cannot be read.
+        let Ok(below) = Path::new(path).strip_prefix(top) else { return Vec::new() };
+        if below.components().any(|part| part == Component::ParentDir) {
+            return Vec::new();
+        }
+        let mut groups: Vec<&Path> = below.ancestors().collect();
+        groups.reverse();
+        groups.into_iter().map(|group| Path::new(mounted).join(group)).collect()
+    }
 }
 
 #[cfg(test)]
@@ -148,24 +147,26 @@ mod tests {
 
     const MOUNTS: &str = "31 23 0:28 / /sys/fs/cgroup rw - tmpfs tmpfs rw\n\
                           32 31 0:29 / /sys/fs/cgroup/cpu rw,relatime shared:9 - cgroup cgroup rw,cpu,cpuacct\n\
-                          33 31 0:31 / /sys/fs/cgroup/cpuset rw - cgroup cgroup rw,cpuset\n";
+                          33 31 0:31 / /sys/fs/cgroup/cpuset rw - cgroup cgroup rw,cpuset\n\
+                          40 31 0:40 / /sys/fs/cgroup/unified rw - cgroup2 cgroup2 rw,nsdelegate\n";
 
-    fn machine(cgroups: &str, budgets: &[(&str, &str)]) -> tempfile::TempDir {
+    fn machine(cgroups: &str, files: &[(&str, &str)]) -> tempfile::TempDir {
         let root = tempfile::tempdir().unwrap();
-        let write = |path: &str, text: &str| {
+        for (path, text) in [("proc/self/cgroup", cgroups), ("proc/self/mountinfo", MOUNTS)].iter().chain(files) {
             let path = root.path().join(path);
             fs::create_dir_all(path.parent().unwrap()).unwrap();
             fs::write(path, text).unwrap();
-        };
-        write("proc/self/cgroup", cgroups);
-        write("proc/self/mountinfo", MOUNTS);
-        budgets.iter().for_each(|(group, text)| write(&format!("sys/fs/cgroup/cpu/{group}cpu.rt_runtime_us"), text));
+        }
         root
     }
 
     #[test]
     fn an_empty_budget_is_found_in_every_group_that_has_one() {
-        let budgets = [("", "950000\n"), ("a/", "0\n"), ("a/b/", "0\n")];
+        let budgets = [
+            ("sys/fs/cgroup/cpu/cpu.rt_runtime_us", "950000\n"),
+            ("sys/fs/cgroup/cpu/a/cpu.rt_runtime_us", "0\n"),
+            ("sys/fs/cgroup/cpu/a/b/cpu.rt_runtime_us", "0\n"),
+        ];
         let empty = |cgroups: &str| empty_budgets(machine(cgroups, &budgets).path());
         let file = |group: &str| PathBuf::from(format!("/sys/fs/cgroup/cpu/{group}cpu.rt_runtime_us"));
         assert_eq!(empty("5:cpuset:/x\n4:cpu,cpuacct:/a/b\n0::/\n"), [file("a/"), file("a/b/")]);
@@ -179,21 +180,15 @@ mod tests {
     #[test]
     fn arbitrary_text_does_not_panic() {
         for (cgroups, mounts) in [("1:cpu:/", " - "), ("1:cpu:/", "a b c d e f - cgroup x"), ("::", "- - - -")] {
-            let _ = find(cgroups, mounts);
+            let cgroups = Cgroups { root: Path::new("/"), cgroups: cgroups.to_owned(), mounts: mounts.to_owned() };
+            let _ = (cgroups.with("cpu"), cgroups.unified());
         }
     }
 
     #[test]
     fn the_group_that_limits_the_cores_is_found_in_both_versions() {
         let set = |cgroups: &str, files: &[(&str, &str)]| {
-            let root = tempfile::tempdir().unwrap();
-            let mounts = format!("{MOUNTS}40 31 0:40 / /sys/fs/cgroup/unified rw - cgroup2 cgroup2 rw,nsdelegate\n");
-            for (path, text) in [("proc/self/cgroup", cgroups), ("proc/self/mountinfo", &*mounts)].iter().chain(files) {
-                let path = root.path().join(path);
-                fs::create_dir_all(path.parent().unwrap()).unwrap();
-                fs::write(path, text).unwrap();
-            }
-            cpu_set(root.path()).map(|found| (found.file.display().to_string(), found.cores))
+            cpu_set(machine(cgroups, files).path()).map(|found| (found.file.display().to_string(), found.cores))
         };
         let found = |file: &str, cores: &str| Some((format!("/sys/fs/cgroup/{file}"), cores.to_owned()));
         let old = [
@@ -220,14 +215,8 @@ mod tests {
     #[test]
     fn the_tightest_quota_of_both_versions_is_found() {
         let quota = |cgroups: &str, files: &[(&str, &str)]| {
-            let root = tempfile::tempdir().unwrap();
-            let mounts = format!("{MOUNTS}40 31 0:40 / /sys/fs/cgroup/unified rw - cgroup2 cgroup2 rw,nsdelegate\n");
-            for (path, text) in [("proc/self/cgroup", cgroups), ("proc/self/mountinfo", &*mounts)].iter().chain(files) {
-                let path = root.path().join(path);
-                fs::create_dir_all(path.parent().unwrap()).unwrap();
-                fs::write(path, text).unwrap();
-            }
-            cpu_quota(root.path()).map(|found| (found.file.display().to_string(), found.quota_us, found.period_us))
+            cpu_quota(machine(cgroups, files).path())
+                .map(|found| (found.file.display().to_string(), found.quota_us, found.period_us))
         };
         let (old, unified) = ("sys/fs/cgroup/cpu", "sys/fs/cgroup/unified");
         let at = |group: &str, file: &str| format!("{group}/{file}");
