@@ -3,9 +3,9 @@
 //! Must not invent anything: a tick without an answer in time has no samples and counts as missed.
 
 use super::context::{LOOK_NS, NodeContext};
-use super::contract::{Node, Poll, RunCondition};
+use super::contract::{Node, Poll, RunCondition, counted};
 use super::missed::MissedTicks;
-use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
+use super::persistent::{Inherited, Persistent, commit, commit_last, restore};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::rig::{Command, Measurement, Rig, Sensors, Truth};
@@ -18,9 +18,7 @@ use crate::runtime::role_id::RoleId;
 use crate::sample::{Message, Sample, Stamp, content_length, copy_fields};
 use crate::serial::{Answer, LineCounters, Samples};
 use crate::state::{Persist, Words};
-use crate::telemetry::{
-    LateRecord, LateTicks, Latency, Ledger, LedgerError, Outage, PaceReport, StageReport, TickCounters, Ticks,
-};
+use crate::telemetry::{LateRecord, Latency, Ledger, LedgerError, Outage, PaceReport, StageReport, TickCounters};
 
 /// A device with its links and counters.
 pub struct BridgeNode<R: Rig, B: Bus> {
@@ -226,12 +224,10 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
 }
 
 impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
+    counted!();
+
     fn time_triggered(&self) -> bool {
         true
-    }
-
-    fn next_tick(&self) -> u64 {
-        self.counters.next()
     }
 
     fn restore(&mut self) -> Result<(), LedgerError> {
@@ -256,11 +252,6 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
         self.truth.finish()?;
         self.skip_to(first_tick);
         Ok(())
-    }
-
-    #[inline]
-    fn before_tick(&mut self) -> bool {
-        self.interruptions.before_next(&mut self.counters)
     }
 
     #[inline]
@@ -338,19 +329,6 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
         self.command.refresh();
         self.measurement.refresh()?;
         Ok(self.truth.refresh()?)
-    }
-
-    fn state_words(&mut self) -> usize {
-        length(self)
-    }
-
-    fn ticks(&self) -> Ticks {
-        self.counters.report()
-    }
-
-    #[inline]
-    fn late_ticks(&self) -> Option<&LateTicks> {
-        Some(self.counters.late_ticks())
     }
 
     fn stages(&self) -> Vec<StageReport> {

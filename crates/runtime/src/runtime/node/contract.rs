@@ -128,3 +128,31 @@ pub trait Node {
 
 /// A node that can be driven.
 pub type ReadyNode = Box<dyn Node>;
+
+/// The methods of a [`Node`] that only look at its fields `counters` and `interruptions`, the same for every role.
+macro_rules! counted {
+    () => {
+        fn next_tick(&self) -> u64 {
+            self.counters.next()
+        }
+
+        #[inline]
+        fn before_tick(&mut self) -> bool {
+            self.interruptions.before_next(&mut self.counters)
+        }
+
+        fn ticks(&self) -> crate::telemetry::Ticks {
+            self.counters.report()
+        }
+
+        #[inline]
+        fn late_ticks(&self) -> Option<&crate::telemetry::LateTicks> {
+            Some(self.counters.late_ticks())
+        }
+
+        fn state_words(&mut self) -> usize {
+            super::persistent::length(self)
+        }
+    };
+}
+pub(super) use counted;

@@ -2,8 +2,8 @@
 
 use super::channel::{AnyChannel, Channel, Channels, Single, Stages};
 use super::context::{LOOK_NS, NodeContext};
-use super::contract::{Node, Poll, RunCondition};
-use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
+use super::contract::{Node, Poll, RunCondition, counted};
+use super::persistent::{Inherited, Persistent, commit, commit_last, restore};
 use super::ports::{driven, is_self_observed};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
@@ -20,7 +20,7 @@ use crate::runtime::sample_source::{Progress, SampleSource};
 use crate::sample::Message;
 use crate::serial::LineCounters;
 use crate::state::{Persist, Words};
-use crate::telemetry::{LateTicks, Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
+use crate::telemetry::{Latency, Ledger, LedgerError, Outage, StageReport, TickCounters};
 
 /// A controller with its links and counters.
 pub struct ControllerNode<R: Rig, B: Bus> {
@@ -279,12 +279,10 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
 }
 
 impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
+    counted!();
+
     fn time_triggered(&self) -> bool {
         false
-    }
-
-    fn next_tick(&self) -> u64 {
-        self.counters.next()
     }
 
     fn restore(&mut self) -> Result<(), LedgerError> {
@@ -310,11 +308,6 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         self.channels.iter_mut().for_each(|channel| channel.start(self.clock, grid, next));
         self.skip_to(first_tick);
         Ok(())
-    }
-
-    #[inline]
-    fn before_tick(&mut self) -> bool {
-        self.interruptions.before_next(&mut self.counters)
     }
 
     #[inline]
@@ -388,21 +381,8 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         self.channels.iter_mut().try_for_each(AnyChannel::refresh)
     }
 
-    fn state_words(&mut self) -> usize {
-        length(self)
-    }
-
-    fn ticks(&self) -> Ticks {
-        self.counters.report()
-    }
-
     fn late_inputs(&self) -> u64 {
         self.inputs.late()
-    }
-
-    #[inline]
-    fn late_ticks(&self) -> Option<&LateTicks> {
-        Some(self.counters.late_ticks())
     }
 
     fn clear_stages(&mut self) {

@@ -1,10 +1,10 @@
 //! An observer on a bus: reads the measurement of its body, sends the estimate.
 
 use super::context::{LOOK_NS, NodeContext};
-use super::contract::{Node, Poll, RunCondition};
+use super::contract::{Node, Poll, RunCondition, counted};
 use super::held::{Held, repeat};
 use super::missed::MissedTicks;
-use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
+use super::persistent::{Inherited, Persistent, commit, commit_last, restore};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::config::InputUser;
@@ -20,7 +20,7 @@ use crate::runtime::sample_source::{Progress, SampleSource};
 use crate::sample::Message;
 use crate::serial::LineCounters;
 use crate::state::{NumberWords, Persist, Words};
-use crate::telemetry::{LateRecord, LateTicks, Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
+use crate::telemetry::{LateRecord, Latency, Ledger, LedgerError, Outage, StageReport, TickCounters};
 
 /// The instants of one executed tick, ns.
 #[derive(Debug, Clone, Copy, Default)]
@@ -180,12 +180,10 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
 }
 
 impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
+    counted!();
+
     fn time_triggered(&self) -> bool {
         false
-    }
-
-    fn next_tick(&self) -> u64 {
-        self.counters.next()
     }
 
     fn restore(&mut self) -> Result<(), LedgerError> {
@@ -208,11 +206,6 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
         self.missed.start(self.clock, grid, self.counters.next());
         self.skip_to(first_tick);
         Ok(())
-    }
-
-    #[inline]
-    fn before_tick(&mut self) -> bool {
-        self.interruptions.before_next(&mut self.counters)
     }
 
     #[inline]
@@ -282,25 +275,12 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
         Ok(self.estimate.refresh()?)
     }
 
-    fn state_words(&mut self) -> usize {
-        length(self)
-    }
-
     fn numbers(&mut self, visit: &mut dyn FnMut(&mut f64)) {
         self.observer.persist(&mut NumberWords(visit));
     }
 
-    fn ticks(&self) -> Ticks {
-        self.counters.report()
-    }
-
     fn late_inputs(&self) -> u64 {
         self.inputs.late()
-    }
-
-    #[inline]
-    fn late_ticks(&self) -> Option<&LateTicks> {
-        Some(self.counters.late_ticks())
     }
 
     fn clear_stages(&mut self) {

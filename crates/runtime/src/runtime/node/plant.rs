@@ -1,9 +1,9 @@
 //! A plant on a bus: reads the command, sends measurement and truth, then integrates.
 
 use super::context::NodeContext;
-use super::contract::{Node, Poll, RunCondition};
+use super::contract::{Node, Poll, RunCondition, counted};
 use super::missed::MissedTicks;
-use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
+use super::persistent::{Inherited, Persistent, commit, commit_last, restore};
 use crate::bus::{Bus, BusError, Carried, Reader, Signal};
 use crate::clock::{Clock, Grid};
 use crate::config::{DISCONNECTED, InputUser};
@@ -17,7 +17,7 @@ use crate::runtime::role_id::RoleId;
 use crate::runtime::role_inputs::{NewValue, RoleInputs};
 use crate::sample::{Field, Message, Stamp, is_number};
 use crate::state::{NumberWords, Persist, Words};
-use crate::telemetry::{LateRecord, LateTicks, Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
+use crate::telemetry::{LateRecord, Latency, Ledger, LedgerError, StageReport, TickCounters};
 use std::borrow::{Borrow, BorrowMut};
 
 /// A body or fleet whose samples links carry.
@@ -309,12 +309,10 @@ fn due<'a, S: Carried + ?Sized, G: Guard<S>, B: Bus>(
 }
 
 impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G, B> {
+    counted!();
+
     fn time_triggered(&self) -> bool {
         true
-    }
-
-    fn next_tick(&self) -> u64 {
-        self.counters.next()
     }
 
     fn restore(&mut self) -> Result<(), LedgerError> {
@@ -342,11 +340,6 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P
         }
         // Otherwise the first poll skips the ticks missed until then.
         Ok(())
-    }
-
-    #[inline]
-    fn before_tick(&mut self) -> bool {
-        self.interruptions.before_next(&mut self.counters)
     }
 
     #[inline]
@@ -424,10 +417,6 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P
         Ok(self.truth.refresh()?)
     }
 
-    fn state_words(&mut self) -> usize {
-        length(self)
-    }
-
     fn numbers(&mut self, visit: &mut dyn FnMut(&mut f64)) {
         let mut numbers = NumberWords(visit);
         self.plant.persist(&mut numbers);
@@ -436,17 +425,8 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P
         in_flight.for_each(|command| numbers.sample(command.borrow_mut().words_mut(), |word| is_number(fields, word)));
     }
 
-    fn ticks(&self) -> Ticks {
-        self.counters.report()
-    }
-
     fn late_inputs(&self) -> u64 {
         self.inputs.late()
-    }
-
-    #[inline]
-    fn late_ticks(&self) -> Option<&LateTicks> {
-        Some(self.counters.late_ticks())
     }
 
     fn clear_stages(&mut self) {
