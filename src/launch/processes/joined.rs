@@ -1,10 +1,11 @@
-//! The supervisor of a host that joined: its own roles, led by the word of another host. Must not lead them itself.
+//! The supervisor of a host that joined: its own roles, led by another host's schedule. Must not lead them itself.
 
+use super::super::Progress;
 use super::*;
 use std::collections::BTreeMap;
 
 impl<'a> Supervisor<'a> {
-    /// The roles of a host in a run that another one leads.
+    /// Starts the roles of a host in a run that another one leads.
     pub fn of_host(
         scenario: &'a Scenario,
         host: &str,
@@ -52,7 +53,7 @@ impl<'a> Supervisor<'a> {
         })
     }
 
-    /// Takes over the word of another host's launcher; whether it says anything new.
+    /// Adopts the schedule of another host's launcher. Returns true if it is new.
     pub fn adopt(&mut self, word: &Schedule) -> bool {
         let Schedule { phase, epoch_ns, credit_tick, .. } = *word;
         let new = (phase, epoch_ns, credit_tick) != (self.word.phase, self.word.epoch_ns, self.word.credit_tick);
@@ -65,13 +66,13 @@ impl<'a> Supervisor<'a> {
         Phase::from_number(self.word.phase)
     }
 
-    /// The tick of the role that is furthest behind, once ticks run.
+    /// Returns the tick of the role that is furthest behind, once ticks run.
     pub fn behind(&self) -> Option<u64> {
         let running = self.phase() >= Phase::Run;
         self.members.iter().map(|member| member.last.stamp.tick).min().filter(|_| running)
     }
 
-    /// The roles that have not reached a state.
+    /// Returns the roles that have not reached a state, as progress.
     pub fn waiting(&self, state: RoleState) -> Progress<'_> {
         let late = self.members.iter().filter(|member| member.state() < state);
         let roles = late.map(|member| &*member.name).collect();
