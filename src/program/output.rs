@@ -95,3 +95,10 @@ pub fn exit_of(error: &LaunchError) -> Exit {
         | LaunchError::Spawn { .. } => Exit::Failure,
     }
 }
+
+/// Prints an event as a line of JSON.
+pub fn event(name: &str, mut fields: serde_json::Value) -> Result<(), Failure> {
+    fields["schema"] = "corotate/event/v1".into();
+    fields["event"] = name.into();
+    print(&format!("{fields}\n"))
+}

@@ -1,33 +1,34 @@
 //! `corotate run`: runs a scenario and prints its verdict.
 
+mod screen;
+mod verdict;
+
 use super::campaign;
-use super::color::{Color, paint};
+use super::color::paint;
 use super::foxglove;
 use super::hosts::{self, KeyArguments};
-use super::output::{Exit, Failure, exit_of, fail, print, remark};
+use super::output::{Exit, Failure, event, exit_of, fail, print, remark};
 use super::perfetto;
 use super::scenario::{Change, changed, load, stem};
-use super::shipped::name;
 use super::signals::{catch_signals, die_with};
-use crate::config::{BodyInfo, ClockKind, RunId};
+use crate::config::{ClockKind, RunId};
 use crate::doctor::{self, Demand, Machine};
 use crate::files;
 use crate::hosts::{Address, HostEndpoint};
 use crate::late::LateReport;
 use crate::launch::{
-    Action, Launch, Outcome, Progress, ResultsError, Summary, check_cores, claim, exact, junit, make_directory,
-    make_latest, new_run, table, tick_words, write_run,
+    Launch, Outcome, ResultsError, Summary, check_cores, claim, junit, make_directory, make_latest, new_run, table,
+    write_run,
 };
 use crate::runtime::{priority_remedy, refused_priority};
 use crate::scenario::Scenario;
-use crate::seat::seat_path;
 use crate::system::tell;
-use indicatif::{ProgressBar, ProgressStyle};
-use std::collections::BTreeMap;
+use screen::{Screen, Verbosity};
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
+use verdict::Verdict;
 
 /// Options of `corotate run`.
 #[derive(clap::Args, Default)]
@@ -293,7 +294,7 @@ pub fn run(arguments: &Arguments) -> Exit {
     let exit = match result {
         Ok((summary, _)) => {
             let verdict = Verdict::new(&summary);
-            verdict.print(arguments).map_or_else(|error| fail(Exit::Failure, error), |()| verdict.exit)
+            print_verdict(&verdict, arguments).map_or_else(|error| fail(Exit::Failure, error), |()| verdict.exit)
         }
         Err(failed) => failed.report(arguments, invalid),
     };
@@ -349,10 +350,14 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
     arguments.trace_out.as_deref().map_or(Ok(()), |out| replace(out, b"", "--trace-out")).map_err(broken)?;
     let signal = catch_signals().map_err(broken)?;
     let bodies = scenario.bodies.clone();
-    let (level, events) = (Verbosity::new(arguments), arguments.events);
+    let level = match arguments {
+        Arguments { quiet: true, .. } => Verbosity::Quiet,
+        Arguments { verbose: true, .. } => Verbosity::Verbose,
+        _ => Verbosity::Usual,
+    };
+    let events = arguments.events;
     let join_command = arguments.listen.as_ref().map(|address| arguments.keys.join_command(address));
-    let mut screen =
-        Screen { bar: None, instructed: false, bodies, level, last_phase: String::new(), events, join_command };
+    let mut screen = Screen::new(bodies, level, events, join_command);
     screen.print_verbose(format_args!("results go to {}", directory.display()));
     if scenario.clock == ClockKind::Realtime && screen.level > Verbosity::Quiet {
         warn_ungranted(scenario);
@@ -429,253 +434,18 @@ fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<
     }
 }
 
-/// The verdict of a finished run: exit code and last line.
-struct Verdict {
-    exit: Exit,
-    word: (&'static str, Color),
-    reason: String,
-}
-
-impl Verdict {
-    fn with(exit: Exit, word: (&'static str, Color), reason: impl Into<String>) -> Self {
-        Self { exit, word, reason: reason.into() }
+/// Prints the last line of a run to the stream of the table.
+fn print_verdict(verdict: &Verdict, arguments: &Arguments) -> Result<(), Failure> {
+    let (word, color) = verdict.word;
+    if arguments.events {
+        event("verdict", serde_json::json!({ "word": word, "reason": verdict.reason, "exit": verdict.exit.code() }))?;
     }
-
-    /// Judges a run and prints its problems to stderr. The reason always counts missed, starved and safe ticks.
-    fn new(summary: &Summary) -> Self {
-        let verdict = Self::without_ticks(summary);
-        let ticks = tick_words(&summary.books);
-        let reason = if ticks.is_empty() { verdict.reason } else { format!("{}; {ticks}", verdict.reason) };
-        Self { reason, ..verdict }
+    if arguments.events && arguments.quiet {
+        return Ok(());
     }
-
-    fn without_ticks(summary: &Summary) -> Self {
-        if !summary.books.balanced {
-            let exit = fail(
-                Exit::Failure,
-                Failure::new("unbalanced", "the counters do not balance: samples or ticks are unaccounted for"),
-            );
-            return Self::with(exit, FAIL, "the counters do not balance");
-        }
-        if let Some(stopped) = summary.incidents.iter().find(|incident| incident.action == Action::Stopped) {
-            // A run in one thread has not printed it yet.
-            if stopped.panic.is_some() && summary.clock == "in-process" {
-                remark(stopped);
-            }
-            let why = stopped.panic.as_ref().map_or(String::new(), |panic| format!(": {panic}"));
-            return Self::with(Exit::ProcessLost, FAIL, format!("the role {} was lost{why}", stopped.role));
-        }
-        if let Some(problem) = summary.recording.as_ref().and_then(|recording| recording.problem.as_ref()) {
-            let exit = fail(
-                Exit::Failure,
-                Failure::new("incomplete-recording", format!("the recording is incomplete: {problem}")),
-            );
-            return Self::with(exit, FAIL, "the recording is incomplete");
-        }
-        let broken: Vec<_> = summary.criteria.iter().filter(|criterion| criterion.holds == Some(false)).collect();
-        for criterion in &broken {
-            let value = criterion.value.map_or("not measured".to_owned(), exact);
-            let role = criterion.role.as_ref().map_or(String::new(), |role| format!("{role}: "));
-            let text = format!("accept.{}: {role}{value}, limit {}", criterion.name, exact(criterion.limit));
-            remark(&Failure::new("not-met", text));
-        }
-        let ended = (summary.signal != 0).then(|| format!("stopped by signal {}", summary.signal));
-        ended.iter().for_each(|ended| remark(&Failure::new("interrupted", ended)));
-        let signal = (summary.signal != 0).then_some(Exit::Signal(summary.signal));
-        match summary.accepted {
-            Some(true) => {
-                let held = summary.criteria.iter().filter(|criterion| criterion.holds == Some(true)).count();
-                let left = match summary.criteria.len() - held {
-                    0 => String::new(),
-                    left => format!(", {left} not judged"),
-                };
-                Self::with(signal.unwrap_or(Exit::Ok), PASS, format!("{}{left}", counted(held, "holds", "hold")))
-            }
-            Some(false) => {
-                let reason = format!("{} of {} not met", broken.len(), counted(summary.criteria.len(), "", ""));
-                Self::with(signal.unwrap_or(Exit::NotAccepted), FAIL, reason)
-            }
-            None => {
-                let reason = summary.verdict.strip_prefix("not judged: ").unwrap_or(&summary.verdict);
-                Self::with(signal.unwrap_or(Exit::Ok), NOT_JUDGED, ended.as_deref().unwrap_or(reason))
-            }
-        }
+    if arguments.json || arguments.events {
+        tell(format_args!("{}: {}", paint(word, color, &io::stderr()), verdict.reason));
+        return Ok(());
     }
-
-    /// Prints the last line to the stream of the table.
-    fn print(&self, arguments: &Arguments) -> Result<(), Failure> {
-        let (word, color) = self.word;
-        if arguments.events {
-            event("verdict", serde_json::json!({ "word": word, "reason": self.reason, "exit": self.exit.code() }))?;
-        }
-        if arguments.events && arguments.quiet {
-            return Ok(());
-        }
-        if arguments.json || arguments.events {
-            tell(format_args!("{}: {}", paint(word, color, &io::stderr()), self.reason));
-            return Ok(());
-        }
-        print(&format!("{}: {}\n", paint(word, color, &io::stdout()), self.reason))
-    }
-}
-
-const PASS: (&str, Color) = ("PASS", Color::Green);
-const FAIL: (&str, Color) = ("FAIL", Color::Red);
-const NOT_JUDGED: (&str, Color) = ("NOT JUDGED", Color::Yellow);
-
-/// Returns the number of criteria with a verb in singular or plural.
-fn counted(count: usize, singular: &str, plural: &str) -> String {
-    let text = if count == 1 { format!("1 criterion {singular}") } else { format!("{count} criteria {plural}") };
-    text.trim_end().to_owned()
-}
-
-/// Prints an event as a line of JSON.
-fn event(name: &str, mut fields: serde_json::Value) -> Result<(), Failure> {
-    fields["schema"] = "corotate/event/v1".into();
-    fields["event"] = name.into();
-    print(&format!("{fields}\n"))
-}
-
-/// The amount of output during a run.
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Verbosity {
-    /// Nothing.
-    Quiet,
-    /// A progress bar on a terminal, and instructions for the user.
-    Usual,
-    /// Also the directory and the phases.
-    Verbose,
-}
-
-impl Verbosity {
-    fn new(arguments: &Arguments) -> Self {
-        match arguments {
-            Arguments { quiet: true, .. } => Self::Quiet,
-            Arguments { verbose: true, .. } => Self::Verbose,
-            _ => Self::Usual,
-        }
-    }
-}
-
-/// Output during a run: a progress bar on a terminal, instructions, phases and events.
-struct Screen {
-    bar: Option<ProgressBar>,
-    /// True once the user has instructions for missing roles or hosts.
-    instructed: bool,
-    /// The bodies of the scenario; a device cannot replace a fleet.
-    bodies: Vec<BodyInfo>,
-    level: Verbosity,
-    /// The last printed phase.
-    last_phase: String,
-    /// True if events are printed.
-    events: bool,
-    /// The command by which other hosts join, without the host's name.
-    join_command: Option<String>,
-}
-
-impl Screen {
-    fn show(&mut self, progress: &Progress<'_>) {
-        self.print_phase(progress);
-        match progress {
-            _ if self.level == Verbosity::Quiet => {}
-            Progress::Waiting { hosts, .. } if !hosts.is_empty() && !self.instructed => {
-                self.instructed = true;
-                let join_command = self.join_command.as_deref().unwrap_or_default();
-                for host in hosts {
-                    tell(format_args!("waiting for host {host}: run there\n  {} {join_command} --host {host}", name()));
-                }
-            }
-            Progress::Waiting { external, domain, .. } if !external.is_empty() && !self.instructed => {
-                self.instructed = true;
-                for role in external {
-                    tell(format_args!("waiting for {role}: start it with\n  {}", self.by_hand(role, domain)));
-                    let seat = seat_path(domain, role);
-                    tell(format_args!("or pass this seat to your own program\n  {}", seat.display()));
-                }
-            }
-            Progress::Waiting { .. } => {}
-            Progress::External(words) => match &self.bar {
-                Some(bar) => bar.suspend(|| tell(words)),
-                None => tell(words),
-            },
-            Progress::Running { tick, last_tick, metric } => {
-                let bar = self.bar.get_or_insert_with(|| bar(*last_tick));
-                bar.set_position(*tick);
-                bar.set_message(if metric.is_nan() { "-".to_owned() } else { format!("{metric:.2e}") });
-            }
-        }
-    }
-
-    /// Prints each phase of a run once, as text with `--verbose` and as events.
-    fn print_phase(&mut self, progress: &Progress<'_>) {
-        let phase = match progress {
-            Progress::Waiting { domain, hosts, .. } if !hosts.is_empty() => {
-                format!("the run's domain is {}; waiting for {}", domain.display(), hosts.join(", "))
-            }
-            Progress::Waiting { domain, .. } => format!("the run's domain is {}", domain.display()),
-            Progress::Running { last_tick, .. } => format!("running ticks 0 to {last_tick}"),
-            Progress::External(words) if self.events => {
-                // As below.
-                let _ = event("notice", serde_json::json!({ "text": words }));
-                return;
-            }
-            Progress::External(_) => return,
-        };
-        if phase != self.last_phase {
-            self.print_verbose(format_args!("{phase}"));
-            self.last_phase = phase;
-            if self.events {
-                // A failure to print is reported at the end of the run.
-                let _ = match progress {
-                    Progress::Waiting { external, domain, hosts, .. } => {
-                        let seat = |role: &&str| (role.to_string(), seat_path(domain, role));
-                        let seats: BTreeMap<String, PathBuf> = external.iter().map(seat).collect();
-                        event("waiting", serde_json::json!({ "domain": domain, "seats": seats, "hosts": hosts }))
-                    }
-                    Progress::Running { last_tick, .. } => {
-                        event("running", serde_json::json!({ "last_tick": last_tick }))
-                    }
-                    Progress::External(_) => Ok(()),
-                };
-            }
-        }
-    }
-
-    fn print_verbose(&self, words: std::fmt::Arguments<'_>) {
-        if self.level == Verbosity::Verbose {
-            remark(&words);
-        }
-    }
-
-    fn by_hand(&self, role: &str, domain: &Path) -> String {
-        let (name, domain) = (name(), domain.display());
-        let fleets = self.bodies.iter().any(|body| body.fleet.is_some());
-        let further = || self.bodies.iter().skip(1).filter(|body| body.observer.is_some());
-        let observed = further().find(|body| body.observer.as_deref() == Some(role));
-        let (command, device) = match (role, observed) {
-            ("observer", _) => (role.to_owned(), !fleets),
-            ("controller", _) => (role.to_owned(), !fleets && !further().any(|body| body.driven)),
-            (_, Some(body)) => (format!("observer --body {}", body.name), true),
-            (body, None) => {
-                let fleet = self.bodies.iter().any(|info| info.name == body && info.fleet.is_some());
-                (format!("plant --body {body}"), body != "leader" && !fleet)
-            }
-        };
-        let by_hand = format!("{name} {command} --domain {domain}");
-        let bridge =
-            || format!("\nor connect a device with\n  {name} bridge --serial PATH --role {role} --domain {domain}");
-        if device { by_hand + &bridge() } else { by_hand }
-    }
-
-    fn clear(&mut self) {
-        if let Some(bar) = self.bar.take() {
-            bar.finish_and_clear();
-        }
-    }
-}
-
-fn bar(last_tick: u64) -> ProgressBar {
-    let style = ProgressStyle::with_template("{bar:40} tick {pos}/{len} {eta} left, error {msg}");
-    // Drawn on stderr, and only if that is a terminal.
-    ProgressBar::new(last_tick).with_style(style.expect("the template is a constant that parses"))
+    print(&format!("{}: {}\n", paint(word, color, &io::stdout()), verdict.reason))
 }
