@@ -1,8 +1,8 @@
 //! A device in the place of a role: the process that serves it until the end of the run.
 
-use super::process::{
-    RoleError, device_failure_path, failure_path, find_role, in_domain, join, require_process, take_ledger, write_whole,
-};
+use super::error::RoleError;
+use super::paths::{device_failure_path, failure_path, take_ledger, write_whole};
+use super::process::{find_role, in_domain, join, require_process};
 use crate::config::{BodyInfo, ClockKind, Settings};
 use crate::runtime::{DeviceConfig, DeviceError, DeviceLink, NodeError, Pace, RoleId, RoleImpl};
 use crate::serial::LineCounters;

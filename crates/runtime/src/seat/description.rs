@@ -2,7 +2,9 @@
 //!
 //! Must be complete and must not contain anything untrue.
 
-use super::process::{RoleError, WARM_UP_PAUSE_NS, WARM_UP_SAMPLES, report_path, scenario_path};
+use super::error::RoleError;
+use super::paths::{report_path, scenario_path};
+use super::process::{WARM_UP_PAUSE_NS, WARM_UP_SAMPLES};
 use crate::bus::domain::Domain;
 use crate::bus::iox::{self, Qos};
 use crate::bus::{Depths, Port, Reader, Signal};

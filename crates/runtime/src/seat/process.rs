@@ -2,26 +2,28 @@
 //!
 //! Must not start or end another process; the launcher's schedule starts and stops the role.
 
-use crate::bus::domain::{Domain, DomainError, domains};
+use super::error::RoleError;
+use super::paths::{
+    changes_path, clock_path, failure_path, listener_path, panic_path, report_path, scenario_path, take_ledger,
+    write_whole,
+};
+use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::changes::ReceivedChanges;
 use crate::clock::{self, Grid, RunClock, monotonic_ns, sleep_until};
-use crate::config::{ClockKind, ConfigError, Realtime, Settings, Wake};
-use crate::files;
+use crate::config::{ClockKind, Realtime, Settings, Wake};
 use crate::panics;
 use crate::runtime::drive::{Driver, Ended, Heartbeat, LauncherLink, WaitPolicy};
 use crate::runtime::hooks::{self, Failpoint};
 use crate::runtime::{
-    DeviceError, LateWatch, NodeError, Privileges, ReadyNode, RoleFunction, RoleId, RoleImpl, depths, ledger_file,
-    ledger_words, ports, release_priority, report, request_short_slices, take_privileges, topic, window_ticks,
+    LateWatch, NodeError, Privileges, ReadyNode, RoleFunction, RoleId, RoleImpl, depths, ports, release_priority,
+    report, request_short_slices, take_privileges, topic, window_ticks,
 };
 use crate::sample::{Phase, RoleState, Schedule};
 use crate::scenario::{self, Scenario};
-use crate::system::{name_thread, remedy};
+use crate::system::name_thread;
 use crate::telemetry::{Latency, Ledger, LedgerError, RoleReport, StageReport};
-use std::io;
-use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
@@ -46,232 +48,6 @@ pub struct RoleAddress {
     pub domain: PathBuf,
     /// The role's name.
     pub role: String,
-}
-
-/// A role ended without a report.
-#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
-#[strum(serialize_all = "kebab-case")]
-pub enum RoleError {
-    /// The directory is not a usable domain.
-    #[error(transparent)]
-    #[strum(transparent)]
-    Domain(#[from] DomainError),
-    /// The scenario in the domain was refused.
-    #[error(transparent)]
-    #[strum(serialize = "refused-scenario")]
-    Config(#[from] ConfigError),
-    /// Only a part of the run's signals exists on this host.
-    #[error("the run in {} was launched on another host, and only a part of its signals exists here; join it on that host", .0.display())]
-    #[strum(serialize = "partial-run")]
-    Part(PathBuf),
-    /// The scenario has no such role.
-    #[error("there is no role `{role}` in this scenario; it has: {known}")]
-    NoSuchRole {
-        /// As given.
-        role: String,
-        /// The existing roles.
-        known: String,
-    },
-    /// The role shares the process of another role.
-    #[error(
-        "in this run {role} runs in the process of {host} (launch.processes); start that one, or give each a process of its own"
-    )]
-    #[strum(serialize = "hosted-role")]
-    Hosted {
-        /// As given.
-        role: String,
-        /// The role that the process is named after.
-        host: String,
-    },
-    /// The run uses another scenario.
-    #[error("the run in {} uses another scenario or other overrides; give its scenario file, {}", domain.display(), scenario.display())]
-    OtherScenario {
-        /// The domain's directory.
-        domain: PathBuf,
-        /// The scenario of its run.
-        scenario: PathBuf,
-    },
-    /// A device cannot have these roles.
-    #[error(
-        "a device cannot be `{roles}`; name one driven body (here: {driven}), observer, controller, or observer,controller, none of \
-         which may serve a fleet"
-    )]
-    #[strum(serialize = "no-device-role")]
-    NoDevice {
-        /// As given.
-        roles: String,
-        /// The driven bodies that are not fleets.
-        driven: String,
-    },
-    /// The controller reads an estimate that the protocol of devices does not carry.
-    #[error(
-        "a device cannot be the controller here: that reads the own estimate of {body}, which a device does not receive; take {body} \
-         out of `observed`, or run the controller as a program"
-    )]
-    DeviceReadsOwn {
-        /// The driven body with an observer of its own.
-        body: String,
-    },
-    /// The device failed or cannot take part.
-    #[error(transparent)]
-    #[strum(transparent)]
-    Device(#[from] DeviceError),
-    /// A link failed.
-    #[error(transparent)]
-    #[strum(transparent)]
-    Bus(#[from] BusError),
-    /// The node cannot continue.
-    #[error(transparent)]
-    #[strum(transparent)]
-    Node(#[from] NodeError),
-    /// The ledger could not be opened.
-    #[error(transparent)]
-    #[strum(transparent)]
-    Ledger(#[from] LedgerError),
-    /// The launcher did not publish the awaited phase in time.
-    #[error("the launcher was silent for {waited_s} s; is `corotate run` alive in this domain?")]
-    NoLauncher {
-        /// Waiting time, s.
-        waited_s: f64,
-    },
-    /// The program that computes the role's samples is gone before the ticks.
-    #[error("no program computes this role: {reason}; start it again")]
-    #[strum(serialize = "no-seat-program")]
-    SeatProgram {
-        /// The reason.
-        reason: String,
-    },
-    /// The samples of the role do not fit into a frame.
-    #[error("the samples of {role} take {bytes} bytes per tick, and a frame holds {limit}; drive fewer bodies")]
-    #[strum(serialize = "frame-too-long")]
-    FrameTooLong {
-        /// The role.
-        role: String,
-        /// Length of a frame of the role, bytes.
-        bytes: usize,
-        /// Longest frame, bytes.
-        limit: usize,
-    },
-    /// The role serves a fleet.
-    #[error("a function cannot compute {role}, which serves a fleet; give its bodies roles of their own")]
-    #[strum(serialize = "fleet-role")]
-    Fleet {
-        /// The role's name.
-        role: String,
-    },
-    /// The run no longer exists, and its launcher sent no stop.
-    #[error("the run no longer exists: its launcher was killed; start it again")]
-    #[strum(serialize = "run-gone")]
-    Gone,
-    /// The launcher ended the run without waiting for this role.
-    #[error(
-        "the run ended while this role still ran, because it did not stop in time; the run's incidents give the reason"
-    )]
-    #[strum(serialize = "run-ended")]
-    Late,
-    /// The run has a clock of its own, which cannot be read.
-    #[error("cannot read the clock of the run in {}: {source}; {}", path.display(), remedy(source))]
-    #[strum(serialize = "no-run-clock")]
-    Clock {
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-    /// The list of received changes cannot be read.
-    #[error("cannot read the changes of inputs in {}: {source}; {}", path.display(), remedy(source))]
-    #[strum(serialize = "no-changes")]
-    Changes {
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-    /// The report could not be written.
-    #[error("cannot write the report {}: {source}; {}", path.display(), remedy(source))]
-    #[strum(serialize = "cannot-write")]
-    Report {
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-}
-
-/// Returns the file in a domain with the scenario of its run.
-pub fn scenario_path(domain: &Domain) -> PathBuf {
-    domain.root().join("scenario.toml")
-}
-
-/// Returns the scenario of the run in a domain's directory, without joining the run.
-///
-/// # Errors
-/// [`ConfigError`].
-pub fn scenario_of(root: &Path) -> Result<Scenario, ConfigError> {
-    Scenario::load(&root.join("scenario.toml"), &[])
-}
-
-/// Returns the file in a domain's directory for a role's report.
-pub fn report_path(root: &Path, role: &str) -> PathBuf {
-    root.join(format!("{role}.report.json"))
-}
-
-/// Returns the file in a domain's directory that shows that a role takes changes of inputs. It contains the number of the process.
-fn listener_path(root: &Path, role: &str) -> PathBuf {
-    root.join(format!("{role}.listens"))
-}
-
-/// Returns the process that declared that it takes changes of inputs for a role. Bridges of devices do not.
-pub fn listening_process(root: &Path, role: &str) -> Option<i32> {
-    std::fs::read_to_string(listener_path(root, role)).ok()?.parse().ok()
-}
-
-/// Returns the file in a domain's directory for the error that ended an external role.
-pub fn failure_path(root: &Path, role: &str) -> PathBuf {
-    root.join(format!("{role}.words"))
-}
-
-/// Returns the file in a domain's directory for the error that ended a bridge in real time. That does not end the run,
-/// because another bridge may take over.
-pub fn device_failure_path(root: &Path, role: &str) -> PathBuf {
-    root.join(format!("{role}.device.words"))
-}
-
-/// Returns the file in a domain's directory for a role's panic.
-pub fn panic_path(root: &Path, role: &str) -> PathBuf {
-    root.join(format!("{role}.panic.json"))
-}
-
-/// Returns the file in a domain's directory with the path of the run's results.
-pub fn results_path(root: &Path) -> PathBuf {
-    root.join("results")
-}
-
-/// The file of a run's results that is written at the end.
-pub const SUMMARY: &str = "summary.json";
-
-/// Returns the domain of a run in progress: the newest, or the one named by its directory, by its results directory, or
-/// by its recording.
-///
-/// # Errors
-/// [`DomainError::NoRun`], [`DomainError::Over`], [`DomainError::NotADomain`], [`DomainError::Privacy`].
-pub fn find_run(given: Option<&Path>) -> Result<PathBuf, DomainError> {
-    // The process that joins the domain reports why it cannot be joined.
-    if let Some(given) = given.filter(|given| !matches!(Domain::join(given), Err(DomainError::NotADomain { .. }))) {
-        return Ok(given.to_owned());
-    }
-    let mut running = domains()?.into_iter().filter(|found| found.alive).map(|found| found.root);
-    let Some(given) = given else { return running.next().ok_or(DomainError::NoRun) };
-    let whole = std::fs::canonicalize(given).unwrap_or_else(|_| given.to_owned());
-    let directory = if whole.is_file() { whole.parent().unwrap_or(&whole) } else { &whole };
-    let meant = |root: &PathBuf| {
-        files::read(&results_path(root)).is_ok_and(|results| results == directory.as_os_str().as_bytes())
-    };
-    match running.find(meant) {
-        Some(root) => Ok(root),
-        None if directory.join(SUMMARY).exists() => Err(DomainError::Over { path: given.to_owned() }),
-        None => Err(DomainError::NotADomain { path: given.to_owned() }),
-    }
 }
 
 /// Runs a role until the end of the run. `terminated` is set by a signal that asks the process to end.
@@ -329,16 +105,6 @@ pub(super) fn require_process(scenario: &Settings, role: RoleId) -> Result<(), R
     let host = role.process_role(scenario);
     let name = |role: RoleId| role.name(scenario).to_owned();
     if host == role { Ok(()) } else { Err(RoleError::Hosted { role: name(role), host: name(host) }) }
-}
-
-/// Returns the file with the changes of inputs that a run has received.
-pub fn changes_path(domain: &Domain) -> PathBuf {
-    domain.shared(ReceivedChanges::FILE)
-}
-
-/// Returns the file with the correction of this host's clock, in a run that was launched on another host.
-pub fn clock_path(domain: &Domain) -> PathBuf {
-    domain.shared("clock")
 }
 
 /// Joins the domain in a directory and loads its scenario. From here on the process uses the clock of that run.
@@ -415,32 +181,11 @@ pub(super) fn in_domain(
     served
 }
 
-/// Opens a role's ledger in a domain for reading.
-pub fn open_ledger(domain: &Domain, scenario: &Settings, role: RoleId) -> Result<Ledger, LedgerError> {
-    Ledger::shared(&ledger_path(domain, scenario, role), ledger_words(scenario, role))
-}
-
-/// Opens a role's ledger in a domain as its only writer.
-pub(super) fn take_ledger(domain: &Domain, scenario: &Settings, role: RoleId) -> Result<Ledger, LedgerError> {
-    Ledger::taken(&ledger_path(domain, scenario, role), ledger_words(scenario, role))
-}
-
-fn ledger_path(domain: &Domain, scenario: &Settings, role: RoleId) -> PathBuf {
-    domain.shared(&ledger_file(scenario, role))
-}
-
 fn write_report(domain: &Domain, report: &RoleReport) -> Result<(), RoleError> {
     let path = report_path(domain.root(), &report.role);
     let failed = |source| RoleError::Report { path: path.clone(), source };
     let text = serde_json::to_vec(report).map_err(|error| failed(error.into()))?;
     write_whole(&path, &text).map_err(failed)
-}
-
-/// Writes a file atomically: no reader sees a part of it.
-pub fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let part = path.with_extension("part");
-    files::write(&part, bytes)?;
-    std::fs::rename(&part, path)
 }
 
 /// The environment of a role process.

@@ -29,7 +29,9 @@
 //! this process died. Must not wait for the program after the run has ended.
 
 use super::description::describe_seat;
-use super::process::{RoleAddress, RoleError, failure_path, find_run, panic_path, run_function_with, write_whole};
+use super::error::RoleError;
+use super::paths::{failure_path, find_run, panic_path, write_whole};
+use super::process::{RoleAddress, run_function_with};
 use crate::bus::Port;
 use crate::bus::domain::Domain;
 use crate::panics;
