@@ -1,7 +1,7 @@
 //! Logs as other programs write them: read at the first try, or refused with their unit or the motion named.
 
 use crate::common::Bench;
-use corotate::model::{Inertia, RigidBody};
+use corotate::model::{Inertia, Noise, RigidBody};
 use nalgebra::Vector3;
 use std::fmt::Write;
 
@@ -231,6 +231,62 @@ fn a_motion_that_is_not_free_gives_no_body_in_a_short_log_too() {
             assert!(!refused.stdout.contains("inertia_kg_m2"), "{name} {method}: {refused:?}");
             let json = bench.run(&["identify", name, "--method", method, "--json"]);
             assert!(json.json()["body"].is_null(), "{name} {method}: {json:?}");
+        }
+    }
+}
+
+/// Returns five throws at 100 Hz of a sensor with noise beside the body's centre, which lies still before each and is stopped after it.
+fn thrown(accelerometer: bool) -> String {
+    let (body, moments) = (RigidBody::new(&Inertia::new(MOMENTS).unwrap()), Vector3::from(MOMENTS));
+    let (place, mut noise) = (Vector3::new(0.02, -0.01, 0.01), Noise::new(5, 0, [0.5; 3], [0.0; 3]));
+    let mut text = format!("t_s,wx_rad_s,wy_rad_s,wz_rad_s{}\n", if accelerometer { ",ax,ay,az" } else { "" });
+    let mut rows = 0;
+    for throw in 0..5 {
+        let (mut rate, mut angle) = (Vector3::new(8.0, 1.0 + f64::from(throw), 6.0), 0.0);
+        for tick in 0..240 {
+            let part = f64::from(240 - tick) / 60.0;
+            let held = Vector3::new(f64::sin(angle), 0.0, f64::cos(angle)) * 9.81;
+            let (shown, force) = match tick {
+                0..100 => (Vector3::zeros(), held),
+                100..180 => {
+                    rate = body.flow(&rate, &Vector3::zeros(), 0.01);
+                    let change = -rate.cross(&moments.component_mul(&rate)).component_div(&moments);
+                    (rate, change.cross(&place) + rate.cross(&rate.cross(&place)))
+                }
+                _ => (rate * part, held),
+            };
+            angle += shown.norm() * 0.01;
+            let shown = shown + noise.sample();
+            write!(text, "{:.2},{:.4},{:.4},{:.4}", f64::from(rows) * 0.01, shown.x, shown.y, shown.z).unwrap();
+            if accelerometer {
+                write!(text, ",{:.3},{:.3},{:.3}", force.x, force.y, force.z).unwrap();
+            }
+            text.push('\n');
+            rows += 1;
+        }
+    }
+    text
+}
+
+#[test]
+fn an_accelerometer_shows_the_free_motion_that_noise_hides() {
+    let bench = Bench::new();
+    for accelerometer in [false, true] {
+        std::fs::write(bench.path("thrown.csv"), thrown(accelerometer)).unwrap();
+        let done = bench.run(&["identify", "thrown.csv", "--find-free", "--method", "tensor", "--json"]);
+        if !accelerometer {
+            assert!(done.code == Some(1) && done.says("not-free"), "{done:?}");
+            continue;
+        }
+        let found = done.succeeded().json();
+        let parts = found["logs"][0]["parts_s"].as_array().unwrap();
+        assert_eq!(parts.len(), 5, "{parts:?}");
+        for (part, throw) in parts.iter().zip(0..) {
+            let ends = [0, 1].map(|end| part[end].as_f64().unwrap() - 2.4 * f64::from(throw));
+            assert!((ends[0] - 1.0).abs() < 0.1 && (ends[1] - 1.8).abs() < 0.1, "{parts:?}");
+        }
+        for (moment, expected) in found["body"]["inertia_kg_m2"].as_array().unwrap().iter().zip(MOMENTS) {
+            assert!((moment.as_f64().unwrap() - expected).abs() < 0.05, "{found:#}");
         }
     }
 }

@@ -1,12 +1,14 @@
 //! Finds the stretches of free motion of one body in a log that also has what happened between them.
 //!
-//! Short windows are taken as they come. A body that is fitted to one of them explains only the free ones among the others,
-//! because the torques of a hand differ every time. So the body that explains the most windows is the one that was thrown,
-//! and its windows are the free motion. Must not use a given body.
+//! Short windows are taken as they come. An accelerometer at a fixed place r of a falling body shows ω̇ × r + ω × (ω × r) and no
+//! gravity, so its windows of free motion are known. Without one, or if it shows none: a body that is fitted to one window
+//! explains only the free ones among the others, because the torques of a hand differ every time. So the body that explains the
+//! most windows is the one that was thrown, and its windows are the free motion. Must not use a given body.
 
 use super::Sample;
 use super::motion::Sums;
 use super::tensor::{Solution, solve};
+use nalgebra::{Matrix3, Vector3};
 use std::vec::Vec;
 
 /// The turn of the fast body in a window, rad, and the number of samples in one.
@@ -21,6 +23,8 @@ const WINDOWS: usize = 20_000;
 const TRIED: usize = 240;
 /// The part of a window's motion that a free body may leave unexplained.
 const UNEXPLAINED: f64 = 0.01;
+/// The part of gravity that an accelerometer may show in free motion beyond that of its place.
+const WEIGHT: f64 = 0.2;
 /// The part of a window by which both ends of a stretch are shortened.
 const TRIM: usize = 16;
 /// The rounds in which the body is fitted to its windows again.
@@ -31,22 +35,29 @@ struct Window {
     first: usize,
     last: usize,
     sums: Sums,
+    weightless: bool,
 }
 
-/// Returns the stretches of free motion in segments of rising times, as pairs of times, s.
-pub fn free_stretches(segments: &[Vec<Sample>]) -> Vec<[f64; 2]> {
+/// Returns the stretches of free motion in segments of rising times, as pairs of times, s. `forces` has an accelerometer's values at
+/// the samples, gravity included, in any unit; NaN without one.
+pub fn free_stretches(segments: &[Vec<Sample>], forces: &[Vector3<f64>]) -> Vec<[f64; 2]> {
     let mut windows = Vec::new();
     let samples: Vec<Sample> = segments.iter().flatten().copied().collect();
     let (Some(fast_rad_s), Some(interval_s)) = (fast(&samples), interval(segments)) else { return Vec::new() };
     let length =
         ((WINDOW_TURN_RAD / (fast_rad_s * interval_s)) as usize).clamp(*WINDOW_SAMPLES.start(), *WINDOW_SAMPLES.end());
+    let slow = samples.iter().zip(forces).filter(|(sample, _)| sample.rate_rad_s.norm() < SLOW * fast_rad_s);
+    let weight = quantile(slow.map(|(_, force)| force.norm()).filter(|force| force.is_finite()), 0.5);
     let mut before = 0;
     for segment in segments {
         for first in (0..segment.len().saturating_sub(length - 1)).step_by((length / STEPS).max(1)) {
             let part = &segment[first..first + length];
             let speed = part.iter().map(|sample| sample.rate_rad_s.norm()).sum::<f64>() / length as f64;
             if speed > SLOW * fast_rad_s {
-                windows.push(Window { first: before + first, last: before + first + length - 1, sums: sums(part) });
+                let (first, last) = (before + first, before + first + length - 1);
+                let force = forces.get(first..=last).and_then(|forces| beside_place(part, forces));
+                let weightless = weight.zip(force).is_some_and(|(weight, force)| force < WEIGHT * weight);
+                windows.push(Window { first, last, sums: sums(part), weightless });
             }
         }
         before += segment.len();
@@ -56,22 +67,26 @@ pub fn free_stretches(segments: &[Vec<Sample>]) -> Vec<[f64; 2]> {
     let compared: Vec<&Window> = windows.iter().step_by(kept).collect();
     let tried = compared.len().div_ceil(TRIED).max(1);
     let count = |body: &Solution| compared.iter().filter(|window| is_free(body, &window.sums)).count();
-    let bodies = compared.iter().step_by(tried).filter_map(|window| solve(&window.sums, true, false));
-    let counted = bodies.filter(is_body).map(|body| (count(&body), body));
-    let Some((_, mut body)) = counted.max_by_key(|(count, _)| *count) else { return Vec::new() };
+    let bodies =
+        || compared.iter().step_by(tried).filter_map(|window| solve(&window.sums, true, false)).filter(is_body);
+    let most = || bodies().map(|body| (count(&body), body)).max_by_key(|(count, _)| *count).map(|(_, body)| body);
+    let mut body = if windows.iter().any(|window| window.weightless) { None } else { most() };
+    let free = |body: Option<&Solution>, window: &Window| {
+        window.weightless || body.is_some_and(|body| is_free(body, &window.sums))
+    };
     for _ in 0..ROUNDS {
         let mut total = Sums::default();
-        for window in compared.iter().filter(|window| is_free(&body, &window.sums)) {
+        for window in compared.iter().filter(|window| free(body.as_ref(), window)) {
             total.scatter += window.sums.scatter;
             total.samples += window.sums.samples;
         }
         match solve(&total, true, true).filter(is_body) {
-            Some(better) => body = better,
+            Some(better) => body = Some(better),
             None => break,
         }
     }
     let mut stretches: Vec<[usize; 2]> = Vec::new();
-    for window in windows.iter().filter(|window| is_free(&body, &window.sums)) {
+    for window in windows.iter().filter(|window| free(body.as_ref(), window)) {
         match stretches.last_mut() {
             Some([_, last]) if *last >= window.first => *last = window.last,
             _ => stretches.push([window.first, window.last]),
@@ -88,19 +103,39 @@ fn sums(part: &[Sample]) -> Sums {
     super::Motion::from_segments([part]).total()
 }
 
+/// Returns the root mean square of what an accelerometer shows beyond ω̇ × r + ω × (ω × r) at the place r that leaves the least.
+fn beside_place(samples: &[Sample], forces: &[Vector3<f64>]) -> Option<f64> {
+    let (mut normal, mut right, mut square) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
+    for (around, force) in samples.windows(3).zip(&forces[1..]) {
+        let change = (around[2].rate_rad_s - around[0].rate_rad_s) / (around[2].time_s - around[0].time_s);
+        let rate = around[1].rate_rad_s.cross_matrix();
+        let map = change.cross_matrix() + rate * rate;
+        normal += map.transpose() * map;
+        right += map.transpose() * force;
+        square += force.norm_squared();
+    }
+    // Places along a single axis of rotation differ by nothing.
+    let place = (normal + Matrix3::identity() * (1e-9 * normal.trace())).cholesky()?.solve(&right);
+    let left = square - right.dot(&place);
+    left.is_finite().then(|| libm::sqrt(left.max(0.0) / (samples.len() - 2) as f64))
+}
+
 /// Returns the rate that the fastest twentieth of the samples exceeds, rad/s.
 fn fast(samples: &[Sample]) -> Option<f64> {
-    let mut rates: Vec<f64> = samples.iter().map(|sample| sample.rate_rad_s.norm()).collect();
-    rates.sort_by(f64::total_cmp);
-    rates.get(rates.len() * 19 / 20).copied().filter(|rate| *rate > 0.0)
+    quantile(samples.iter().map(|sample| sample.rate_rad_s.norm()), 0.95).filter(|rate| *rate > 0.0)
 }
 
 /// Returns the usual interval, s.
 fn interval(segments: &[Vec<Sample>]) -> Option<f64> {
-    let mut intervals: Vec<f64> =
-        segments.iter().flat_map(|segment| segment.windows(2).map(|pair| pair[1].time_s - pair[0].time_s)).collect();
-    intervals.sort_by(f64::total_cmp);
-    intervals.get(intervals.len() / 2).copied()
+    let pairs = segments.iter().flat_map(|segment| segment.windows(2));
+    quantile(pairs.map(|pair| pair[1].time_s - pair[0].time_s), 0.5)
+}
+
+/// Returns the value that a part of the values stay below.
+fn quantile(values: impl Iterator<Item = f64>, part: f64) -> Option<f64> {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    values.get((values.len() as f64 * part) as usize).copied()
 }
 
 /// Returns true if a body has these moments.
@@ -157,7 +192,7 @@ mod tests {
     #[test]
     fn the_throws_between_hand_motions_are_found_and_nothing_else() {
         let (samples, cuts) = log(20);
-        let found = free_stretches(&[samples]);
+        let found = free_stretches(&[samples], &[]);
         let overlap =
             |cut: &[f64; 2]| found.iter().map(|own| (own[1].min(cut[1]) - own[0].max(cut[0])).max(0.0)).sum::<f64>();
         let hits = cuts.iter().filter(|cut| overlap(cut) > 0.3).count();
@@ -180,10 +215,49 @@ mod tests {
                 _ => segments.push(vec![sample]),
             }
         }
-        let found: f64 = free_stretches(&segments).iter().map(|own| own[1] - own[0]).sum();
+        let found: f64 = free_stretches(&segments, &[]).iter().map(|own| own[1] - own[0]).sum();
         assert!(found < 0.5, "{found}");
         let rest = |tick| Sample { time_s: f64::from(tick), rate_rad_s: Vector3::zeros() };
-        assert!(free_stretches(&[(0..100).map(rest).collect()]).is_empty());
-        assert!(free_stretches(&[]).is_empty() && free_stretches(&[vec![rest(0)]]).is_empty());
+        assert!(free_stretches(&[(0..100).map(rest).collect()], &[]).is_empty());
+        assert!(free_stretches(&[], &[]).is_empty() && free_stretches(&[vec![rest(0)]], &[]).is_empty());
+    }
+
+    #[test]
+    fn an_accelerometer_beside_the_centre_shows_the_throws_of_a_body_about_one_axis() {
+        let place = Vector3::new(0.08, -0.03, 0.05);
+        let (mut samples, mut forces, mut cuts) = (Vec::new(), Vec::new(), Vec::new());
+        let mut noise = Noise::new(5, 0, [5e-3; 3], [0.0; 3]);
+        for throw in 0..10 {
+            // It lies still, swings with the hand, flies about one axis, and swings again.
+            let begin_s = 2.9 * f64::from(throw);
+            cuts.push([begin_s + 1.5, begin_s + 2.2]);
+            let mut angle = 0.0;
+            for tick in 0..290 {
+                let speed = |tick: i32| {
+                    9.0 * libm::fmin(f64::from(tick - 80) / 70.0, f64::from(290 - tick) / 40.0).clamp(0.0, 1.0)
+                };
+                let (rate, change) =
+                    (Vector3::y() * speed(tick), Vector3::y() * ((speed(tick + 1) - speed(tick - 1)) / 0.02));
+                let mut force = change.cross(&place) + rate.cross(&rate.cross(&place));
+                angle -= rate.y * 0.01;
+                if !(150..220).contains(&tick) {
+                    force += Vector3::new(libm::sin(angle), 0.0, libm::cos(angle)) * 9.81;
+                }
+                let t = f64::from(tick) * 0.01;
+                samples.push(Sample { time_s: begin_s + t, rate_rad_s: rate + noise.sample() });
+                forces.push(force + noise.sample() * 10.0);
+            }
+        }
+        for unit in [1.0, 1.0 / 9.81] {
+            let forces: Vec<Vector3<f64>> = forces.iter().map(|force| force * unit).collect();
+            let found = free_stretches(&[samples.clone()], &forces);
+            assert_eq!(found.len(), cuts.len(), "{found:?}");
+            for (found, cut) in found.iter().zip(&cuts) {
+                assert!((found[0] - cut[0]).abs() < 0.1 && (found[1] - cut[1]).abs() < 0.1, "{found:?} {cut:?}");
+            }
+        }
+        // Without gravity it tells nothing.
+        let linear = vec![Vector3::zeros(); samples.len()];
+        assert_eq!(free_stretches(&[samples.clone()], &linear), free_stretches(&[samples], &[]));
     }
 }

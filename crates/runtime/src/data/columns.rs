@@ -1,6 +1,6 @@
 //! Finds the column and the unit of each quantity: from the options, else by name. Must not guess between two candidates.
 
-use super::form::{DataError, Meaning, Options};
+use super::form::{Cut, DataError, Meaning, Options};
 use super::plausible::since_1970;
 use super::stamp::Stamp;
 use super::table::number;
@@ -28,6 +28,9 @@ const RATE_PARTS: &str =
 /// Words of quantities that are related to an angular velocity.
 const NO_RATE_WORDS: &str = "bias offset cov covariance std stddev var variance accel acc acceleration linear mag temp temperature \
                              setpoint desired des target cmd command ref error noise";
+/// Words of quantities that are related to an acceleration.
+const NO_FORCE_WORDS: &str =
+    "bias offset cov covariance std stddev var variance angular setpoint desired target cmd command error noise";
 /// Words beside a unit that make it another one.
 const MODIFIERS: &str = "centi deci micro nano kilo per min minute h hr hour day s ms us s2 sq squared 2s ns ss";
 /// Parts of words that look like a unit of angular velocity, and words that look like a unit of time.
@@ -200,6 +203,45 @@ struct RateName {
     axis: Axis,
 }
 
+/// Takes the axis out of the words of a name; the second value is true for roll, pitch and yaw. Where the axis begins or ends a word, as
+/// in `wx`, `xgyro` and `omega1`, `is_stem` tells if it may be left out.
+fn take_axis(words: &mut Vec<String>, is_stem: impl Fn(&str, &str) -> bool) -> Option<(Axis, bool)> {
+    let digit = |word: &str| word.parse::<usize>().ok().filter(|digit| word.len() == 1 && *digit < 4);
+    if let Some((at, axis)) = (0..words.len()).rev().find_map(|at| Some((at, axis_of(&words[at])?))) {
+        return Some((Axis::Letter(axis), words.remove(at).len() > 1));
+    }
+    let last = words.pop()?;
+    if let Some(index) = digit(&last) {
+        return Some((Axis::Number(index), false));
+    }
+    let before = words.concat();
+    let parts = ["x", "y", "z", "roll", "pitch", "yaw", "0", "1", "2", "3"].iter().flat_map(|part| {
+        let rests = [last.strip_suffix(part), last.strip_prefix(part).filter(|_| digit(part).is_none())];
+        rests.into_iter().flatten().map(move |rest| (*part, rest))
+    });
+    let mut found = parts.map(|(part, rest)| (part, before.clone() + rest));
+    let (part, stem) = found.find(|(part, stem)| is_stem(part, stem))?;
+    *words = vec![stem];
+    let axis = digit(part).map(Axis::Number).or_else(|| axis_of(part).map(Axis::Letter))?;
+    Some((axis, part.len() > 2))
+}
+
+/// Takes a name for that of an acceleration, best with gravity in it.
+fn force_name(name: &str) -> Option<RateName> {
+    let mut words = words(&brackets(name).0);
+    while words.last().is_some_and(|word| listed("g mg m s s2 ss mss ms2 mps2", word) && words.len() > 1) {
+        words.pop();
+    }
+    let is_force = |word: &str| word == "a" || (word.contains("acc") && !word.contains("accur"));
+    let (axis, turn) = take_axis(&mut words, |_, stem| is_force(stem))?;
+    let related = |word: &String| listed(NO_FORCE_WORDS, word);
+    if turn || words.iter().any(related) || !words.iter().any(|word| is_force(word)) {
+        return None;
+    }
+    let rank = usize::from(words.iter().any(|word| listed("linear lin user", word)));
+    Some(RateName { rank, stem: words.concat(), axis })
+}
+
 /// Takes a name for that of an angular velocity. `gyro` is true if the file's name says that it has nothing else.
 fn rate_name(name: &str, gyro: bool) -> Option<RateName> {
     let (claim, mut words) = rate_claim(name);
@@ -212,33 +254,11 @@ fn rate_name(name: &str, gyro: bool) -> Option<RateName> {
     {
         return Some(RateName { rank: 3, stem: "pqr".to_owned(), axis: Axis::Letter(axis) });
     }
-    let digit = |word: &str| word.parse::<usize>().ok().filter(|digit| word.len() == 1 && *digit < 4);
-    // True for roll, pitch and yaw.
-    let mut turn = false;
-    let axis = if let Some((at, axis)) = (0..words.len()).rev().find_map(|at| Some((at, axis_of(&words[at])?))) {
-        turn = words.remove(at).len() > 1;
-        Axis::Letter(axis)
-    } else if let Some(index) = words.last().and_then(|last| digit(last)) {
-        words.pop();
-        Axis::Number(index)
-    } else {
-        // The begin or the end of a word, as in `wx`, `xgyro` and `omega1`.
-        let last = words.pop()?;
-        let before = words.concat();
-        let parts = ["x", "y", "z", "roll", "pitch", "yaw", "0", "1", "2", "3"].iter().flat_map(|part| {
-            let rests = [last.strip_suffix(part), last.strip_prefix(part).filter(|_| digit(part).is_none())];
-            rests.into_iter().flatten().map(move |rest| (*part, rest))
-        });
-        let found = parts.map(|(part, rest)| (part, before.clone() + rest));
-        let (part, stem) = found.into_iter().find(|(part, stem)| {
-            listed(RATES, stem)
-                || RATE_PARTS.split(' ').any(|part| stem.contains(part))
-                || (part.len() > 2 && stem == "speed")
-        })?;
-        turn = part.len() > 2;
-        words = vec![stem];
-        digit(part).map(Axis::Number).or_else(|| axis_of(part).map(Axis::Letter))?
-    };
+    let (axis, turn) = take_axis(&mut words, |part, stem| {
+        listed(RATES, stem)
+            || RATE_PARTS.split(' ').any(|part| stem.contains(part))
+            || (part.len() > 2 && stem == "speed")
+    })?;
     words.retain(|word| word != "xyz");
     let stem = words.concat();
     let part = RATE_PARTS.split(' ').any(|part| stem.contains(part));
@@ -265,6 +285,8 @@ pub struct Places {
     pub time_part: Option<(usize, TimeUnit)>,
     /// The columns of the rates; `None` for a missing one.
     pub rates: [Option<usize>; 3],
+    /// The columns of an accelerometer, where free motion is searched.
+    pub forces: Option<[usize; 3]>,
     /// The column that separates segments.
     pub by: Option<usize>,
     /// The names and units of the columns.
@@ -303,6 +325,8 @@ pub fn find(
         None => None,
     };
     let given_rate = search.rate_unit(&rates)?;
+    let forces = search.best(&force_name).ok().flatten().filter(|_| options.cut == Cut::Free);
+    let forces = forces.and_then(|[x, y, z]| Some([x?, y?, z?]));
     let name = |index: Option<usize>| index.map_or_else(|| "-".to_owned(), |index| names[index].clone());
     let mut assumed = Vec::new();
     assumed.extend(given_time.is_none().then_some("time"));
@@ -314,7 +338,7 @@ pub fn find(
         assumed,
         found: String::new(),
     };
-    Ok(Places { time, time_part, rates, by, meaning })
+    Ok(Places { time, time_part, rates, forces, by, meaning })
 }
 
 impl Search<'_> {
@@ -427,8 +451,13 @@ impl Search<'_> {
     fn rates_by_name(&self) -> Result<Option<[Option<usize>; 3]>, DataError> {
         let file = self.path.file_stem().map(|stem| stem.to_string_lossy().to_lowercase()).unwrap_or_default();
         let gyro = file.contains("gyro") || file.contains("angular");
+        self.best(&|name| rate_name(name, gyro))
+    }
+
+    /// Returns the best columns of three axes among those that `parse` knows; `None` without any.
+    fn best(&self, parse: &dyn Fn(&str) -> Option<RateName>) -> Result<Option<[Option<usize>; 3]>, DataError> {
         let named: Vec<(usize, RateName)> =
-            self.names.iter().enumerate().filter_map(|(index, name)| Some((index, rate_name(name, gyro)?))).collect();
+            self.names.iter().enumerate().filter_map(|(index, name)| Some((index, parse(name)?))).collect();
         let mut groups: Vec<(usize, [Option<usize>; 3])> = Vec::new();
         for (_, first) in &named {
             let group = || named.iter().filter(|(_, name)| name.stem == first.stem);
@@ -546,6 +575,39 @@ mod tests {
         let bare = found(&["wz", "t", "wx", "wy", "ax", "ay", "az"], &Options::default()).unwrap();
         assert_eq!((bare.time, bare.rates), (Some(1), [Some(2), Some(3), Some(0)]));
         assert_eq!(bare.meaning.assumed, ["time", "rate"]);
+    }
+
+    #[test]
+    fn an_accelerometer_is_found_where_free_motion_is_searched() {
+        let free = Options { cut: Cut::Free, ..Options::default() };
+        for names in [
+            ["ax", "ay", "az"],
+            ["acc_x", "acc_y", "acc_z"],
+            ["ax_m_s2", "ay_m_s2", "az_m_s2"],
+            ["Accelerometer x (m/s^2)", "Accelerometer y (m/s^2)", "Accelerometer z (m/s^2)"],
+            ["linear_acceleration.x", "linear_acceleration.y", "linear_acceleration.z"],
+            ["AccX", "AccY", "AccZ"],
+            ["accSmooth[0]", "accSmooth[1]", "accSmooth[2]"],
+            ["accelX_g", "accelY_g", "accelZ_g"],
+            ["a_RS_S_x [m s^-2]", "a_RS_S_y [m s^-2]", "a_RS_S_z [m s^-2]"],
+            ["userAccelerationX", "userAccelerationY", "userAccelerationZ"],
+        ] {
+            let whole = [&["t", "wx", "wy", "wz"][..], &names].concat();
+            assert_eq!(found(&whole, &free).unwrap().forces, Some([4, 5, 6]), "{names:?}");
+            assert_eq!(found(&whole, &Options::default()).unwrap().forces, None);
+            // One that shows gravity is better.
+            let both = [&whole[..], &["userAccelX", "userAccelY", "userAccelZ"]].concat();
+            let best =
+                if names[0].starts_with("user") || names[0].starts_with("linear") { None } else { Some([4, 5, 6]) };
+            assert_eq!(found(&both, &free).unwrap().forces, best, "{names:?}");
+        }
+        for names in [["mag_x", "mag_y", "mag_z"], ["acc_bias_x", "acc_bias_y", "acc_bias_z"], ["ax", "ay", "x"]] {
+            assert_eq!(
+                found(&[&["t", "wx", "wy", "wz"][..], &names].concat(), &free).unwrap().forces,
+                None,
+                "{names:?}"
+            );
+        }
     }
 
     #[test]

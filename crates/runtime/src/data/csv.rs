@@ -270,6 +270,9 @@ impl Csv {
                 None => f64::NAN,
             };
         }
+        row.force = places
+            .forces
+            .map(|columns| columns.map(|column| lines.number(column, "").ok().flatten().unwrap_or(f64::NAN)));
         row.key.clear();
         if let Some(column) = places.by {
             row.key.extend_from_slice(lines.cell(column));

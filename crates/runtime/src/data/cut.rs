@@ -3,6 +3,7 @@
 use super::form::{Cut, DataError, Options};
 use super::log::Log;
 use crate::identify::{Sample, free_stretches};
+use nalgebra::Vector3;
 use std::path::Path;
 
 /// The largest number of rows in which free motion is searched, because all are held in memory.
@@ -58,22 +59,22 @@ fn find_free(path: &Path, options: &Options) -> Result<Vec<[f64; 2]>, DataError>
         let reason = "the log is read twice to find the free motion, so it must be a file; name one".to_owned();
         return Err(DataError::Option { name: "find free", reason });
     }
-    let whole = Options { needed: [true; 3], cut: Cut::Whole, ..options.clone() };
-    let (mut segments, mut rows): (Vec<Vec<Sample>>, usize) = (Vec::new(), 0);
-    for entry in Log::open(path, &whole)? {
-        let entry = entry?;
+    let whole = Options { needed: [true; 3], cut: Cut::Free, ..options.clone() };
+    let (mut segments, mut forces): (Vec<Vec<Sample>>, Vec<Vector3<f64>>) = (Vec::new(), Vec::new());
+    let mut log = Log::open_whole(path, &whole)?;
+    while let Some(entry) = log.next().transpose()? {
         if entry.begins {
             segments.push(Vec::new());
         }
-        rows += 1;
-        if rows > ROWS {
+        forces.push(log.force().into());
+        if forces.len() > ROWS {
             let reason = format!("the log has more than {ROWS} rows; read a part of it with --from and --to");
             return Err(DataError::Option { name: "find free", reason });
         }
         let sample = Sample { time_s: entry.time_s, rate_rad_s: entry.rate_rad_s.into() };
         segments.last_mut().expect("the first row begins one").push(sample);
     }
-    let found = free_stretches(&segments);
+    let found = free_stretches(&segments, &forces);
     if found.is_empty() { Err(DataError::NotFree { path: path.to_owned() }) } else { Ok(found) }
 }
 

@@ -243,6 +243,8 @@ pub(super) struct Row {
     /// `None` if the row has no time.
     pub stamp: Option<Stamp>,
     pub rate_rad_s: [f64; 3],
+    /// The values of an accelerometer in its own unit, where free motion is searched.
+    pub force: Option<[f64; 3]>,
     /// The value in the column that separates segments.
     pub key: Vec<u8>,
 }

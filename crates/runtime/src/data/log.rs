@@ -92,6 +92,15 @@ impl Log {
     /// # Errors
     /// [`DataError`], here and for every row.
     pub fn open(path: &Path, options: &Options) -> Result<Self, DataError> {
+        if options.cut == Cut::Free {
+            let reason = "the free motion is found before a log is read; give its times".to_owned();
+            return Err(DataError::Option { name: "find free", reason });
+        }
+        Self::open_whole(path, options)
+    }
+
+    /// Opens a log; [`Cut::Free`] reads all of it, with an accelerometer.
+    pub(super) fn open_whole(path: &Path, options: &Options) -> Result<Self, DataError> {
         if path.as_os_str() == "-" {
             return Self::from_csv(io::stdin(), "standard input".as_ref(), options);
         }
@@ -101,6 +110,7 @@ impl Log {
         if about.is_dir() {
             return Err(failed(io::ErrorKind::IsADirectory.into()));
         }
+        let mut named = path.to_owned();
         // A pipe cannot be read twice.
         if about.is_file() {
             let peek = |file: &mut File| -> io::Result<Vec<u8>> {
@@ -109,10 +119,11 @@ impl Log {
                 file.rewind().map(|()| start)
             };
             let mut start = peek(&mut file).map_err(failed)?;
-            if let Some(unpacked) = packed::unpacked(&start, &mut file).map_err(failed)? {
-                file = unpacked;
+            if let Some((unpacked, name)) = packed::unpacked(&start, &mut file, path)? {
+                (file, named) = (unpacked, name);
                 start = peek(&mut file).map_err(failed)?;
             }
+            let path = &named;
             if let Some(error) = packed::foreign(&start, path) {
                 return Err(error);
             }
@@ -129,7 +140,7 @@ impl Log {
                 return Err(DataError::Form { path: path.to_owned(), line: 0, reason: reason.to_owned() });
             }
         }
-        Self::from_csv(file, path, options)
+        Self::from_csv(file, &named, options)
     }
 
     /// Reads a table as text from any source; `path` is its name in messages.
@@ -147,10 +158,6 @@ impl Log {
         if let Some(gap_s) = options.gap_s.filter(|gap_s| !(gap_s.is_finite() && *gap_s > 0.0)) {
             let reason = format!("a pause of {gap_s} s is out of range; give a number above 0");
             return Err(DataError::Option { name: "gap", reason });
-        }
-        if options.cut == Cut::Free {
-            let reason = "the free motion is found before a log is read; give its times".to_owned();
-            return Err(DataError::Option { name: "find free", reason });
         }
         let mut head = VecDeque::new();
         while head.len() < HEAD_ROWS {
@@ -219,6 +226,11 @@ impl Log {
             true => self.counts.segments.to_string(),
             false => String::from_utf8_lossy(&self.last_key).into_owned(),
         }
+    }
+
+    /// Returns the last row's values of an accelerometer; NaN where unknown.
+    pub(super) fn force(&self) -> [f64; 3] {
+        self.row.force.unwrap_or([f64::NAN; 3])
     }
 
     /// Returns the next used row; `None` at the end.

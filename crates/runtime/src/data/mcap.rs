@@ -223,9 +223,10 @@ impl Content {
                     Form::Imu => imu(data),
                     Form::Own { omega, valid, generation } => own(data, header.publish_time, omega, valid, generation),
                 };
-                let (stamp, rates) = decoded.ok_or("the message is shorter than its type; log again")?;
+                let (stamp, rates, force) = decoded.ok_or("the message is shorter than its type; log again")?;
                 let rad_s = self.meaning.rates.1.rad_s();
                 (row.number, row.stamp, row.rate_rad_s) = (self.messages, stamp, rates.map(|rate| rate * rad_s));
+                row.force = Some(force);
                 row.key.clear();
                 return Ok(true);
             }
@@ -249,15 +250,15 @@ fn form(name: &str, data: &[u8]) -> Option<Form> {
     Some(Form::Own { omega: field(OMEGA, FieldKind::F64, 3)?, valid, generation })
 }
 
-/// A stamp and three rates.
-type Decoded = (Option<Stamp>, [f64; 3]);
+/// A stamp, three rates, and the values of an accelerometer.
+type Decoded = (Option<Stamp>, [f64; 3], [f64; 3]);
 
 /// Returns the value if it is finite, else NaN.
 fn finite(value: f64) -> f64 {
     if value.is_finite() { value } else { f64::NAN }
 }
 
-/// Reads `sensor_msgs/msg/Imu`: header (stamp, frame), orientation with covariance, angular velocity.
+/// Reads `sensor_msgs/msg/Imu`: header (stamp, frame), then orientation, angular velocity and acceleration, each with its covariance.
 fn imu(message: &[u8]) -> Option<Decoded> {
     let (header, body) = message.split_at_checked(CDR_HEADER)?;
     let little = header[1] & 1 == 1;
@@ -274,8 +275,9 @@ fn imu(message: &[u8]) -> Option<Decoded> {
     // 8-byte numbers are aligned to 8 within the body.
     let orientation = 12_usize.checked_add(length as usize)?.checked_next_multiple_of(8)?;
     let first = orientation.checked_add(8 * (4 + 9))?;
-    let rates = [number(first)?, number(first + 8)?, number(first + 16)?];
-    Some((Some(Stamp::whole(stamp, TimeUnit::Nanoseconds)), rates.map(finite)))
+    let three = |first: usize| Some([number(first)?, number(first + 8)?, number(first + 16)?].map(finite));
+    let force = three(first.checked_add(8 * (3 + 9))?).unwrap_or([f64::NAN; 3]);
+    Some((Some(Stamp::whole(stamp, TimeUnit::Nanoseconds)), three(first)?, force))
 }
 
 /// Reads a recorded sample. A no-sample marker has no stamp; an invalid component has no value.
@@ -298,7 +300,7 @@ fn own(
         }
     }
     let stamp = i64::try_from(publish_time).ok().filter(|_| !no_sample);
-    Some((stamp.map(|stamp| Stamp::whole(stamp, TimeUnit::Nanoseconds)), rates))
+    Some((stamp.map(|stamp| Stamp::whole(stamp, TimeUnit::Nanoseconds)), rates, [f64::NAN; 3]))
 }
 
 #[cfg(test)]

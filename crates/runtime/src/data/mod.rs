@@ -10,7 +10,7 @@
 //! | `csv` | rows of a text |
 //! | `mcap` | rows of an MCAP file |
 //! | `parquet` | rows of a Parquet file, with the feature of that name |
-//! | `packed` | gzip, zstd, and files of other programs |
+//! | `packed` | gzip, zip, zstd, and files of other programs |
 //! | `stamp`, `unit` | time stamps without rounding, and units |
 //! | `plausible` | units that were assumed |
 //! | `identification` | a body's inertia from logs |

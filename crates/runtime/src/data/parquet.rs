@@ -21,7 +21,7 @@ pub struct ParquetLog {
     places: Places,
     /// The next group of rows.
     group: usize,
-    /// The columns read of the current group: stamps, then rates, then the key.
+    /// The columns read of the current group: stamps, rates, the key, the rest of the stamps, and an accelerometer.
     columns: Vec<Option<Column>>,
     /// The rows returned from the batch, and all its rows.
     given: usize,
@@ -97,6 +97,7 @@ impl ParquetLog {
         let places = &self.places;
         let part = places.time_part.map(|(column, _)| column);
         let wanted = [places.time].into_iter().chain(places.rates).chain([places.by, part]);
+        let wanted = wanted.chain(places.forces.into_iter().flatten().map(Some));
         let schema = self.reader.metadata().file_metadata().schema_descr();
         let mut columns = Vec::new();
         for index in wanted {
@@ -220,6 +221,13 @@ impl Rows for ParquetLog {
                 Cell::Text(_) => return Err(self.cell_error(1 + axis, "is a text; give numbers")),
             };
         }
+        row.force = self.places.forces.map(|_| {
+            [6, 7, 8].map(|column| match self.cell(column) {
+                Cell::Whole(value) => *value as f64,
+                Cell::Float(value) => *value,
+                Cell::None | Cell::Text(_) => f64::NAN,
+            })
+        });
         row.key.clear();
         match self.cell(4) {
             Cell::None => {}
