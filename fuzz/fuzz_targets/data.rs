@@ -18,7 +18,7 @@ fn read(bytes: Vec<u8>, options: &Options) {
     let (mut motion, mut recursive, mut survey) =
         (Motion::default(), RecursiveIdentifier::new(None, 0.1), RateSurvey::new(&coefficients, 3));
     let filter = FilterKind::First { decay_per_s: 5.0 };
-    let setup = Setup { coefficients, axis: 3, damping_per_s: 0.1, filter, guess_rad_s: None, floor_rad_s: 1e-3 };
+    let setup = Setup { coefficients, axis: 3, damping_per_s: 0.1, wheel: None, filter, guess_rad_s: None, floor_rad_s: 1e-3 };
     let mut reconstruction = Reconstruction::new(&setup).expect("the axis is observable");
     let mut last_s = f64::NEG_INFINITY;
     for entry in log.by_ref() {

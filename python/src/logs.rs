@@ -131,6 +131,7 @@ pub fn reconstruct<'py>(
         coefficients: *body.coefficients(),
         axis: hidden,
         damping_per_s,
+        wheel: None,
         filter,
         guess_rad_s: guess,
         floor_rad_s,

@@ -2,6 +2,7 @@
 
 use super::output::Exit;
 use crate::data::{Cut, DataError, LogAccount, Options, RateUnit, TimeUnit, read_parts};
+use nalgebra::Vector3;
 use std::fmt::Write;
 use std::path::PathBuf;
 
@@ -102,6 +103,11 @@ pub fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
     let numbers = parsed.ok().and_then(|numbers| <[f64; N]>::try_from(numbers).ok());
     let finite = numbers.filter(|numbers| numbers.iter().all(|number| number.is_finite()));
     finite.ok_or_else(|| format!("give {N} finite numbers separated by commas"))
+}
+
+/// Parses a vector.
+pub fn three(text: &str) -> Result<Vector3<f64>, String> {
+    numbers::<3>(text).map(Vector3::from)
 }
 
 fn time_unit(name: &str) -> Result<TimeUnit, String> {

@@ -1,9 +1,9 @@
 //! `corotate estimate`: estimates the rate about one axis of a body from a log of the other two.
 
-use super::data::{AXES, LogArguments, axis, exit_of, log_json, numbers, write_log};
+use super::data::{AXES, LogArguments, axis, exit_of, log_json, numbers, three, write_log};
 use super::output::{CommandResult, Exit, Failure, fail, harmless, say};
 use crate::data::{EstimateError, Estimated, Estimation, FilterOrder, Request, estimate_log};
-use crate::estimate::{FilterKind, SegmentScore};
+use crate::estimate::{FilterKind, SegmentScore, Wheel};
 use crate::files;
 use crate::model::Inertia;
 #[cfg(feature = "parquet")]
@@ -49,6 +49,10 @@ pub struct Arguments {
     /// Air damping c of the torque -c I w, 1/s [default: the body's, else 0]
     #[arg(long, value_name = "C", allow_negative_numbers = true, hide_short_help = true)]
     damping: Option<f64>,
+    /// Momentum of a wheel about the sensor's axes, N m s, for an inertia in kg m2 [default: the body's, else 0]
+    #[arg(long, value_name = "X,Y,Z", value_parser = three, allow_hyphen_values = true, hide_short_help = true,
+        conflicts_with = "find_free")]
+    wheel: Option<Vector3<f64>>,
     /// Principal axes in sensor axes: a matrix row by row, axes in columns [default: the body's, else the sensor's]
     #[arg(long, value_name = "NINE", value_parser = nine, allow_hyphen_values = true, hide_short_help = true)]
     axes: Option<Matrix3<f64>>,
@@ -102,10 +106,6 @@ Examples:
                                    a log without the hidden rate
   corotate estimate gyro.csv --hidden y --body body.json --filter kalman";
 
-fn three(text: &str) -> Result<Vector3<f64>, String> {
-    numbers::<3>(text).map(Vector3::from)
-}
-
 fn nine(text: &str) -> Result<Matrix3<f64>, String> {
     numbers::<9>(text).map(|numbers| Matrix3::from_row_slice(&numbers))
 }
@@ -114,6 +114,7 @@ fn nine(text: &str) -> Result<Matrix3<f64>, String> {
 struct Body {
     moments: Vector3<f64>,
     damping_per_s: f64,
+    wheel: Option<Vector3<f64>>,
     axes: Option<Matrix3<f64>>,
 }
 
@@ -126,6 +127,7 @@ pub fn estimate(arguments: &Arguments) -> CommandResult {
         axis: arguments.hidden,
         coefficients: inertia.coefficients(),
         damping_per_s: arguments.damping.unwrap_or(body.damping_per_s),
+        wheel: arguments.wheel.or(body.wheel).map(|momentum| Wheel { momentum, moments: body.moments }),
         axes: arguments.axes.or(body.axes),
         order: match arguments.filter {
             Order::First => FilterOrder::First,
@@ -240,7 +242,7 @@ fn is_same(a: &Path, b: &Path) -> bool {
 fn body(arguments: &Arguments) -> Result<Body, Failure> {
     let Some(path) = &arguments.body else {
         let moments = arguments.inertia.unwrap_or_else(Vector3::zeros);
-        return Ok(Body { moments, damping_per_s: 0.0, axes: None });
+        return Ok(Body { moments, damping_per_s: 0.0, wheel: None, axes: None });
     };
     let text = std::fs::read_to_string(path)
         .map_err(|error| format!("cannot read {}: {error}; name a readable file", path.display()))
@@ -257,6 +259,7 @@ fn read_body(text: &str) -> Result<Body, (&'static str, String)> {
     struct Found {
         inertia_kg_m2: [f64; 3],
         damping_per_s: f64,
+        wheel_n_m_s: Option<[f64; 3]>,
         axes: Option<[[f64; 3]; 3]>,
     }
     #[derive(serde::Deserialize)]
@@ -271,7 +274,8 @@ fn read_body(text: &str) -> Result<Body, (&'static str, String)> {
     }
     let found = printed.body.ok_or_else(|| ("no-body", "the identification found no body".to_owned()))?;
     let axes = found.axes.map(|rows| Matrix3::from_fn(|row, column| rows[row][column]));
-    Ok(Body { moments: found.inertia_kg_m2.into(), damping_per_s: found.damping_per_s, axes })
+    let wheel = found.wheel_n_m_s.map(Vector3::from);
+    Ok(Body { moments: found.inertia_kg_m2.into(), damping_per_s: found.damping_per_s, wheel, axes })
 }
 
 /// Columns of tables, after the segment's name.
@@ -420,6 +424,10 @@ fn write_results(request: &Request, estimation: &Estimation, text: &mut String) 
     if request.damping_per_s != 0.0 {
         writeln!(text, "  damping {:.4} 1/s", request.damping_per_s)?;
     }
+    if let Some(wheel) = request.wheel {
+        let [x, y, z] = wheel.momentum.into();
+        writeln!(text, "  wheel of ({x:.3e}, {y:.3e}, {z:.3e}) N m s")?;
+    }
     if request.axes.is_some() {
         writeln!(text, "  the principal axes are rotated against the sensor's")?;
     }
@@ -510,6 +518,7 @@ fn to_json(request: &Request, estimation: &Estimation) -> Value {
         "hidden_axis": AXES[request.axis - 1],
         "coefficients": <[f64; 3]>::from(request.coefficients),
         "damping_per_s": request.damping_per_s,
+        "wheel_n_m_s": request.wheel.map(|wheel| <[f64; 3]>::from(wheel.momentum)),
         "filter": filter,
         "floor_rad_s": estimation.floor_rad_s,
         "rate_chosen": estimation.chosen,

@@ -1,6 +1,6 @@
 //! `corotate identify`: identifies a body's inertia from logs of its angular velocity.
 
-use super::data::{AXES, LogArguments, axis, exit_of, log_json, write_log};
+use super::data::{AXES, LogArguments, axis, exit_of, log_json, three, write_log};
 use super::output::{CommandResult, Exit, Failure, fail, harmless, say};
 use crate::data::{Identified, Ways, identify_logs};
 use crate::identify::{AxesFit, Finding, RecursiveFit, TensorFit, nearest_body};
@@ -25,6 +25,10 @@ pub struct Arguments {
     /// Symmetry axis of the body: x, y or z
     #[arg(long, value_name = "AXIS", value_parser = axis, hide_short_help = true)]
     symmetry_axis: Option<usize>,
+    /// Momentum of a wheel in the body, about the sensor's axes, N m s; gives the moments their scale
+    #[arg(long, value_name = "X,Y,Z", value_parser = three, allow_hyphen_values = true, hide_short_help = true,
+        conflicts_with_all = ["symmetry_axis", "decay", "find_free"])]
+    wheel: Option<Vector3<f64>>,
     /// Do not fit air damping
     #[arg(long)]
     no_damping: bool,
@@ -80,7 +84,16 @@ pub fn identify(arguments: &Arguments) -> CommandResult {
             Failure::new("missing-axis", "--method axisymmetric lacks an axis; add --symmetry-axis x, y or z"),
         ));
     }
-    let ways = Ways { damping: !arguments.no_damping, decay: arguments.decay, symmetry_axis: arguments.symmetry_axis };
+    if arguments.wheel.is_some() && !matches!(arguments.method, Method::Axes | Method::Tensor) {
+        let reason = "the papers' filters know no wheel; give --method axes or tensor";
+        return Err(fail(Exit::Usage, Failure::new("wheel-not-modelled", reason)));
+    }
+    let ways = Ways {
+        damping: !arguments.no_damping,
+        decay: arguments.decay,
+        symmetry_axis: arguments.symmetry_axis,
+        wheel: arguments.wheel.unwrap_or_else(Vector3::zeros),
+    };
     let options = arguments.log.options();
     let identified = options.and_then(|options| identify_logs(&arguments.data, &options, &ways));
     let identified = identified.map_err(|error| fail(exit_of(&error), error))?;
@@ -111,7 +124,8 @@ fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, Failure>
         || Failure::new("no-motion", "the log does not determine a body: no motion can be fitted; see the notes");
     let body_from_fit = |fit: &Option<TensorFit>, turned: bool| -> Result<Body, Failure> {
         let fit = fit.as_ref().ok_or_else(nothing)?;
-        let (moments, deviation) = (fit.moments, fit.deviation);
+        let scale = fit.largest.map_or(1.0, |(largest, _)| largest);
+        let (moments, deviation) = (fit.moments * scale, fit.deviation.map(|deviation| deviation * scale));
         Ok(Body { moments, deviation, damping_per_s: fit.damping_per_s, axes: turned.then_some(fit.axes) })
     };
     let damping_per_s = identified.recursive_damping_per_s;
@@ -121,8 +135,8 @@ fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, Failure>
         Method::Axes => body_from_fit(&identified.body, false)?,
         Method::Tensor => body_from_fit(&identified.tensor, true)?,
         Method::Recursive => {
-            let ratios = InertiaRatios::new(&identified.recursive.coefficients)
-                .map_err(|error| Failure::new("no-body", error))?;
+            let fit = identified.recursive.as_ref().ok_or_else(nothing)?;
+            let ratios = InertiaRatios::new(&fit.coefficients).map_err(|error| Failure::new("no-body", error))?;
             known(Vector3::new(1.0, ratios.second, ratios.third))
         }
         Method::Axisymmetric => {
@@ -165,20 +179,20 @@ fn write_results(
     }
     if let Some(fit) = &identified.body {
         writeln!(text, "one body about the sensor's axes, least squares")?;
-        row("moments, largest = 1", &fit.moments, text)?;
-        deviations(fit.deviation.as_ref(), text)?;
-        damping(fit, text)?;
+        write_moments(fit, text)?;
     }
     if let Some(fit) = &identified.tensor {
         write_tensor(fit, text)?;
     }
-    writeln!(text, "the papers' recursive filter{}", memory_text(arguments, identified))?;
     let sensor = identified.axes.map_or(0.0, |fit| fit.residual_rad_s.norm() / 3.0_f64.sqrt());
-    write_recursive(&identified.recursive, sensor, text)?;
-    if let Ok(ratios) = InertiaRatios::new(&identified.recursive.coefficients) {
-        let moments = Vector3::new(1.0, ratios.second, ratios.third);
-        row("moments, largest = 1", &(moments / moments.max()), text)?;
-        writeln!(text, "  a1 + a2 + a3 + a1 a2 a3            {:>11.4}", ratios.closure)?;
+    if let Some(fit) = &identified.recursive {
+        writeln!(text, "the papers' recursive filter{}", memory_text(arguments, identified))?;
+        write_recursive(fit, sensor, text)?;
+        if let Ok(ratios) = InertiaRatios::new(&fit.coefficients) {
+            let moments = Vector3::new(1.0, ratios.second, ratios.third);
+            row("moments, largest = 1", &(moments / moments.max()), text)?;
+            writeln!(text, "  a1 + a2 + a3 + a1 a2 a3            {:>11.4}", ratios.closure)?;
+        }
     }
     if let (Some(fit), Some(axis)) = (&identified.axisymmetric, arguments.symmetry_axis) {
         writeln!(text, "the papers' recursive filter, symmetric about {}", AXES[axis - 1])?;
@@ -190,11 +204,11 @@ fn write_results(
     match body {
         Some(body) => {
             let [x, y, z] = body.moments.into();
-            writeln!(
-                text,
-                "\ninertia_kg_m2 = [{x:.6}, {y:.6}, {z:.6}]   # ratios only; method {}",
-                name(arguments.method)
-            )
+            let method = name(arguments.method);
+            match arguments.wheel {
+                Some(_) => writeln!(text, "\ninertia_kg_m2 = [{x:.5e}, {y:.5e}, {z:.5e}]   # method {method}"),
+                None => writeln!(text, "\ninertia_kg_m2 = [{x:.6}, {y:.6}, {z:.6}]   # ratios only; method {method}"),
+            }
         }
         None => Ok(()),
     }
@@ -231,15 +245,23 @@ fn write_axes(fit: &AxesFit, text: &mut String) -> std::fmt::Result {
 
 fn write_tensor(fit: &TensorFit, text: &mut String) -> std::fmt::Result {
     writeln!(text, "the whole tensor, least squares")?;
-    row("moments, largest = 1", &fit.moments, text)?;
-    deviations(fit.deviation.as_ref(), text)?;
-    damping(fit, text)?;
+    write_moments(fit, text)?;
     for (sensor, letter) in AXES.iter().enumerate() {
         row(&format!("principal axes, {letter} component"), &fit.axes.row(sensor).transpose(), text)?;
     }
     row("angle to sensor axes, degrees", &fit.tilt_rad().map(f64::to_degrees), text)?;
     deviations(fit.axes_deviation_rad.map(|deviation| deviation.map(f64::to_degrees)).as_ref(), text)?;
     row("R2, explained part", &fit.r_squared, text)
+}
+
+fn write_moments(fit: &TensorFit, text: &mut String) -> std::fmt::Result {
+    row("moments, largest = 1", &fit.moments, text)?;
+    deviations(fit.deviation.as_ref(), text)?;
+    if let Some((largest, deviation)) = fit.largest {
+        let deviation = deviation.map_or(String::new(), |deviation| format!(" (standard deviation {deviation:.1e})"));
+        writeln!(text, "  largest moment, kg m2              {largest:>11.4e}{deviation}")?;
+    }
+    damping(fit, text)
 }
 
 fn damping(fit: &TensorFit, text: &mut String) -> std::fmt::Result {
@@ -304,7 +326,7 @@ fn to_json(arguments: &Arguments, identified: &Identified, body: Option<&Body>) 
         })),
         "one_body": identified.body.as_ref().map(tensor_json),
         "tensor": identified.tensor.as_ref().map(tensor_json),
-        "recursive": recursive(&identified.recursive),
+        "recursive": identified.recursive.as_ref().map(recursive),
         "axisymmetric": identified.axisymmetric.map(|fit| json!({
             "axis": arguments.symmetry_axis,
             "coefficient": fit.coefficients.x,
@@ -318,6 +340,7 @@ fn to_json(arguments: &Arguments, identified: &Identified, body: Option<&Body>) 
             "inertia_kg_m2": triple(&body.moments),
             "inertia_deviation": body.deviation.as_ref().map(triple),
             "damping_per_s": body.damping_per_s,
+            "wheel_n_m_s": arguments.wheel.as_ref().map(triple),
             "axes": body.axes.as_ref().map(rows),
         })),
     })
@@ -328,6 +351,8 @@ fn tensor_json(fit: &TensorFit) -> Value {
         "moments": triple(&fit.moments),
         "deviation": fit.deviation.as_ref().map(triple),
         "axes": rows(&fit.axes),
+        "largest_kg_m2": fit.largest.map(|(largest, _)| largest),
+        "largest_deviation_kg_m2": fit.largest.and_then(|(_, deviation)| deviation),
         "axes_deviation_rad": fit.axes_deviation_rad.as_ref().map(triple),
         "tilt_rad": triple(&fit.tilt_rad()),
         "damping_per_s": fit.damping_per_s,

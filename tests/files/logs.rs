@@ -292,6 +292,57 @@ fn an_accelerometer_shows_the_free_motion_that_noise_hides() {
 }
 
 #[test]
+fn a_wheel_is_part_of_the_model_and_gives_the_moments_their_scale() {
+    let bench = Bench::new();
+    let text = include_str!("../data/gyrostat.csv");
+    std::fs::write(bench.path("log.csv"), text).unwrap();
+    // The same body with its sensor turned about z, by cosine 0.8 and sine 0.6.
+    let turned = text.lines().enumerate().map(|(line, text)| {
+        let cells: Vec<f64> = text.split(',').filter_map(|cell| cell.parse().ok()).collect();
+        match (line, &cells[..]) {
+            (0, _) => text.to_owned(),
+            (_, [t, x, y, z]) => format!("{t},{:.6},{:.6},{z}", 0.8 * x + 0.6 * y, 0.8 * y - 0.6 * x),
+            _ => panic!("{text}"),
+        }
+    });
+    std::fs::write(bench.path("turned.csv"), turned.collect::<Vec<_>>().join("\n")).unwrap();
+    for (log, wheel, method) in [
+        ("log.csv", "0.004,-0.006,0.012", "axes"),
+        ("log.csv", "0.004,-0.006,0.012", "tensor"),
+        ("turned.csv", "-0.0004,-0.0072,0.012", "tensor"),
+    ] {
+        let found = bench.run(&["identify", log, "--wheel", wheel, "--method", method, "--json"]).succeeded();
+        std::fs::write(bench.path("body.json"), &found.stdout).unwrap();
+        let mut moments: Vec<f64> = serde_json::from_value(found.json()["body"]["inertia_kg_m2"].clone()).unwrap();
+        moments.sort_by(f64::total_cmp);
+        for (moment, expected) in moments.iter().zip([0.030, 0.042, 0.050]) {
+            assert!((moment / expected - 1.0).abs() < 2e-3, "{log} {method}: {found:?}");
+        }
+        assert!(found.json()["recursive"].is_null(), "{found:?}");
+        for axis in ["x", "y", "z"] {
+            let estimated =
+                bench.run(&["estimate", log, "--hidden", axis, "--body", "body.json", "--json"]).succeeded();
+            let part = estimated.json()["score"]["part"]["median"].as_f64().unwrap();
+            assert!(part < 0.01, "{log} {axis}: {part}");
+        }
+    }
+    for (wheel, code) in [
+        // Without the wheel it is the motion of no body, and with the opposite one too.
+        (&[][..], "not-free"),
+        (&["--wheel", "-0.004,0.006,-0.012"][..], "no-such-wheel"),
+    ] {
+        let refused = bench.run(&[&["identify", "log.csv"], wheel].concat());
+        assert!(refused.code == Some(1) && refused.says(code), "{wheel:?}: {refused:?}");
+        assert!(!refused.stdout.contains("inertia_kg_m2"), "{refused:?}");
+    }
+    let refused = bench.run(&["identify", "log.csv", "--wheel", "0,0,1", "--method", "recursive"]);
+    assert!(refused.code == Some(2) && refused.says("wheel-not-modelled"), "{refused:?}");
+    let alike = ["--inertia", "0.03,0.05,0.05", "--wheel", "0,0.01,0"];
+    let refused = bench.run(&[&["estimate", "log.csv", "--hidden", "z"], &alike[..]].concat());
+    assert!(refused.code == Some(2) && refused.says("impossible-estimate"), "{refused:?}");
+}
+
+#[test]
 fn an_estimate_tells_why_it_is_useless() {
     let bench = Bench::new();
     std::fs::write(bench.path("good.csv"), plain("t_s,wx_rad_s,wy_rad_s,wz_rad_s\n", 1.0)).unwrap();

@@ -1,5 +1,6 @@
 //! The hidden component, sample by sample: segments, initial guesses and damping around the relation and its filters.
 
+use super::Wheel;
 use crate::identify::{Sample, undamped};
 use crate::observe::{
     Filter, HiddenRate, HiddenRateError, Increment, Interval, InvariantFilter, KalmanFilter, Observation, RateSample,
@@ -43,6 +44,8 @@ pub struct Setup {
     pub axis: usize,
     /// The damping by a torque −c I ω, 1/s; not negative for air.
     pub damping_per_s: f64,
+    /// A wheel in the body.
+    pub wheel: Option<Wheel>,
     /// The filter.
     pub filter: FilterKind,
     /// The initial estimate of every segment, rad/s; if absent, the reconstruction of the first observable step.
@@ -57,6 +60,14 @@ pub enum ReconstructionError {
     /// The axis cannot be observed.
     #[error(transparent)]
     Relation(#[from] HiddenRateError),
+    /// The wheel acts on an axis whose moment equals that of the hidden one.
+    #[error(
+        "the wheel turns about axis {axis}, whose moment is that of the hidden axis: such a body is not estimated; hide another axis"
+    )]
+    Wheel {
+        /// The axis, 1 to 3.
+        axis: usize,
+    },
     /// A number is invalid.
     #[error("{name} = {value}: give a finite number{}", if *.positive { " above 0" } else { "" })]
     Number {
@@ -96,6 +107,7 @@ pub struct Reconstructed {
 ///     coefficients: inertia.coefficients(),
 ///     axis: 3,
 ///     damping_per_s: 0.0,
+///     wheel: None,
 ///     filter: FilterKind::First { decay_per_s: 8.0 },
 ///     guess_rad_s: None,
 ///     floor_rad_s: 1e-6,
@@ -116,9 +128,10 @@ pub struct Reconstruction {
     guess: Filter<1>,
     guess_rad_s: Option<f64>,
     damping_per_s: f64,
+    wheel: Option<Wheel>,
     filter: Filter<1>,
-    /// The time of the last sample, and its terms in the relation.
-    last: Option<(f64, Regressor)>,
+    /// The last sample, and its terms in the relation.
+    last: Option<(Sample, Regressor)>,
     /// True if the filter has an estimate.
     begun: bool,
     /// The last step's length with the quantities derived from it; most steps are equal.
@@ -141,6 +154,9 @@ impl Reconstruction {
         number("guess, rad/s", setup.guess_rad_s.unwrap_or(0.0), true, false)?;
         positive("floor, rad/s", setup.floor_rad_s)?;
         let relation = HiddenRate::new(&setup.coefficients, setup.axis, setup.floor_rad_s)?;
+        if let Some(axis) = setup.wheel.and_then(|wheel| wheel.singular(setup.axis)) {
+            return Err(ReconstructionError::Wheel { axis });
+        }
         let first = Vector1::new(setup.guess_rad_s.unwrap_or(0.0));
         let (relation, guess) = match setup.filter {
             FilterKind::First { decay_per_s } => {
@@ -166,6 +182,7 @@ impl Reconstruction {
             guess,
             guess_rad_s: setup.guess_rad_s,
             damping_per_s: setup.damping_per_s,
+            wheel: setup.wheel,
             filter: guess,
             last: None,
             begun: false,
@@ -184,14 +201,21 @@ impl Reconstruction {
     /// finite. Returns the hidden component at it.
     #[inline]
     pub fn push(&mut self, sample: &Sample) -> Reconstructed {
-        let Some((last_s, from)) = self.last else { return self.begin(sample) };
-        let interval_s = sample.time_s - last_s;
+        let Some((last, mut from)) = self.last else { return self.begin(sample) };
+        let interval_s = sample.time_s - last.time_s;
         if interval_s != self.interval_s {
             let (undamped_s, growth) = undamped(interval_s, self.damping_per_s);
             (self.interval, self.interval_s, self.growth) = (undamped_s.into(), interval_s, growth);
         }
         // On the clock and with the rates of a motion without damping, see `undamped`.
-        let to = self.regressor(&(sample.rate_rad_s * self.growth));
+        let to = self.free(&(sample.rate_rad_s * self.growth), self.growth);
+        if self.wheel.is_some() {
+            // The wheel's torque changes over the step; the relation takes its mean.
+            let mut start = self.free(&last.rate_rad_s, 1.0);
+            start.torque_rad_s2 = (start.torque_rad_s2 + to.torque_rad_s2) * 0.5;
+            from = self.relation.regressor(&start);
+        }
+        let to = self.relation.regressor(&to);
         let (observed, too_long) = match self.relation.observe(&from, &to, self.interval, self.filter.estimate().x) {
             Observation::Seen(increment) => {
                 self.apply(&increment);
@@ -203,9 +227,9 @@ impl Reconstruction {
             }
         };
         if self.growth == 1.0 {
-            self.last = Some((sample.time_s, to));
+            self.last = Some((*sample, to));
         } else {
-            self.last = Some((sample.time_s, self.regressor(&sample.rate_rad_s)));
+            self.last = Some((*sample, self.relation.regressor(&self.free(&sample.rate_rad_s, 1.0))));
             self.filter = self.filter.with_guess(self.filter.estimate() / self.growth);
         }
         Reconstructed { too_long, ..self.result(observed) }
@@ -214,7 +238,7 @@ impl Reconstruction {
     /// Begins a segment. Its first sample carries no information about the hidden component.
     #[cold]
     fn begin(&mut self, sample: &Sample) -> Reconstructed {
-        self.last = Some((sample.time_s, self.regressor(&sample.rate_rad_s)));
+        self.last = Some((*sample, self.relation.regressor(&self.free(&sample.rate_rad_s, 1.0))));
         (self.filter, self.begun) = (self.guess, self.guess_rad_s.is_some());
         self.result(false)
     }
@@ -229,9 +253,14 @@ impl Reconstruction {
         self.filter.step(increment);
     }
 
+    /// Returns the sample of a body without a wheel that moves alike. All rates, and so the wheel's momentum, are `growth` times as
+    /// large.
     #[inline]
-    fn regressor(&self, rate_rad_s: &Vector3<f64>) -> Regressor {
-        self.relation.regressor(&RateSample { rate_rad_s: *rate_rad_s, torque_rad_s2: Vector3::zeros() })
+    fn free(&self, rate_rad_s: &Vector3<f64>, growth: f64) -> RateSample {
+        match &self.wheel {
+            None => RateSample { rate_rad_s: *rate_rad_s, torque_rad_s2: Vector3::zeros() },
+            Some(wheel) => wheel.as_torque(rate_rad_s, self.relation.hidden() + 1, growth, self.damping_per_s),
+        }
     }
 
     #[inline]
@@ -258,7 +287,7 @@ mod tests {
 
     fn setup(moments: [f64; 3], axis: usize, filter: FilterKind) -> Setup {
         let coefficients = Inertia::new(moments).unwrap().coefficients();
-        Setup { coefficients, axis, damping_per_s: 0.0, filter, guess_rad_s: None, floor_rad_s: 1e-6 }
+        Setup { coefficients, axis, damping_per_s: 0.0, wheel: None, filter, guess_rad_s: None, floor_rad_s: 1e-6 }
     }
 
     /// Returns the largest error over the last half of 4 s of tumbling at 100 Hz, and the number of samples not
@@ -301,6 +330,36 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn every_axis_of_a_damped_body_with_a_wheel_is_found() {
+        let (moments, momentum) = (Vector3::new(0.03, 0.042, 0.05), Vector3::new(0.004, -0.006, 0.012));
+        for (axis, damping_per_s) in [(1, 0.0), (2, 0.0), (3, 0.0), (1, 0.05), (2, 0.05), (3, 0.05)] {
+            let slope = |rate: Vector3<f64>| -> Vector3<f64> {
+                -rate.cross(&(moments.component_mul(&rate) + momentum)).component_div(&moments) - damping_per_s * rate
+            };
+            let wheel = Some(Wheel { momentum, moments });
+            let setup = Setup { wheel, damping_per_s, ..setup(moments.into(), axis, FILTERS[0]) };
+            let mut reconstruction = Reconstruction::new(&setup).unwrap();
+            let (mut rate, mut worst) = (Vector3::new(0.5, -0.35, 0.25), 0.0_f64);
+            for tick in 0..1000 {
+                let mut measured = rate;
+                measured[axis - 1] = f64::NAN;
+                let estimate = reconstruction.push(&Sample { time_s: f64::from(tick) * 0.02, rate_rad_s: measured });
+                if tick > 100 {
+                    worst = worst.max((estimate.rate_rad_s - rate[axis - 1]).abs());
+                }
+                let first = slope(rate);
+                let second = slope(rate + first * 0.01);
+                let third = slope(rate + second * 0.01);
+                rate += (first + second * 2.0 + third * 2.0 + slope(rate + third * 0.02)) * (0.02 / 6.0);
+            }
+            assert!(worst < 1e-4, "{axis} {damping_per_s}: {worst:e}");
+        }
+        let alike = Wheel { momentum, moments: Vector3::new(0.03, 0.05, 0.05) };
+        let refused = Reconstruction::new(&Setup { wheel: Some(alike), ..setup([0.03, 0.05, 0.05], 3, FILTERS[0]) });
+        assert!(matches!(refused, Err(ReconstructionError::Wheel { axis: 2 })));
     }
 
     #[test]

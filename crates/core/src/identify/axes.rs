@@ -50,8 +50,11 @@ struct Axis {
 impl Motion {
     /// Fits a body whose principal axes are the sensor's; with `damping`, the air's torque too.
     ///
-    /// Returns `None` if the motion has no piece, or carries no information about an axis.
+    /// Returns `None` if the motion has no piece, or carries no information about an axis, or the body has a wheel.
     pub fn about_known_axes(&self, damping: bool) -> Option<AxesFit> {
+        if self.has_wheel() {
+            return None;
+        }
         let total = self.total();
         let axes = fit(&total, damping)?;
         let scatter = total.scatter.diagonal();

@@ -200,12 +200,29 @@ pub enum Finding {
     },
     /// Another tensor fits nearly as well.
     #[error(
-        "the whole tensor is not known by this log: another one fits nearly as well (ratio {distinction:.2}); log a motion \
-         about all axes"
+        "{} not known by this log: another one fits nearly as well (ratio {distinction:.2}); log a motion about all axes",
+        if *whole { "the whole tensor is" } else { "the body about the sensor's axes is" }
     )]
     Indistinct {
+        /// True for the whole tensor.
+        whole: bool,
         /// The ratio of the fits.
         distinction: f64,
+    },
+    /// The motion does not show the wheel as given.
+    #[error(
+        "the motion does not show the wheel as given: with it, the largest moment {}would be {largest:.3e} kg m2{}; check its \
+         sign and its axes, or log a longer motion",
+        if *whole { "" } else { "about the sensor's axes " },
+        deviation.map_or(String::new(), |deviation| format!(" (standard deviation {deviation:.1e})"))
+    )]
+    Wheel {
+        /// True for the whole tensor.
+        whole: bool,
+        /// The largest moment.
+        largest: f64,
+        /// Its standard deviation, if it is known.
+        deviation: Option<f64>,
     },
 }
 
@@ -230,6 +247,7 @@ impl From<&Finding> for &'static str {
             Finding::Open { .. } => "not-closed",
             Finding::Tilted { .. } => "tilted",
             Finding::Indistinct { .. } => "indistinct",
+            Finding::Wheel { .. } => "no-such-wheel",
         }
     }
 }
@@ -245,6 +263,8 @@ impl Finding {
                 | Self::Unexcited { .. }
                 | Self::Scaled { .. }
                 | Self::NotFree { whole: false, .. }
+                | Self::Indistinct { whole: false, .. }
+                | Self::Wheel { whole: false, .. }
         )
     }
 
@@ -255,9 +275,10 @@ impl Finding {
             Self::Short { .. }
                 | Self::Still { .. }
                 | Self::OneAxis { .. }
-                | Self::Indistinct { .. }
+                | Self::Indistinct { whole: true, .. }
                 | Self::Scaled { .. }
                 | Self::NotFree { whole: true, .. }
+                | Self::Wheel { whole: true, .. }
         )
     }
 }
@@ -269,7 +290,7 @@ fn three(numbers: &Vector3<f64>) -> String {
 }
 
 /// Returns the findings about these fits, about the sensor's axes each by itself and as one body, and of the whole tensor, the
-/// most serious first; always includes the unknown scale.
+/// most serious first; includes the unknown scale unless the body has a wheel.
 pub fn findings(
     motion: &Motion,
     axes: Option<&AxesFit>,
@@ -295,14 +316,21 @@ pub fn findings(
         found.extend(body.and_then(|body| not_free(motion, fit, body)));
         about_axes(fit, &mut found);
     }
+    if let Some(fit) = body.filter(|_| motion.has_wheel()) {
+        found.extend(not_free_at_all(motion, fit, false));
+        found.extend(wheel(fit, false));
+    }
     if let Some(fit) = tensor {
-        found.extend(not_free_at_all(motion, fit));
+        found.extend(not_free_at_all(motion, fit, true));
+        found.extend(wheel(fit, true));
         about_tensor(fit, &mut found);
     }
     if summary.pieces < 4 {
         found.push(Finding::FewPieces { pieces: summary.pieces });
     }
-    found.push(Finding::Scale);
+    if !motion.has_wheel() {
+        found.push(Finding::Scale);
+    }
     found
 }
 
@@ -378,18 +406,28 @@ fn not_free(motion: &Motion, fit: &AxesFit, body: &TensorFit) -> Option<Finding>
     })
 }
 
-fn not_free_at_all(motion: &Motion, fit: &TensorFit) -> Option<Finding> {
+fn not_free_at_all(motion: &Motion, fit: &TensorFit, whole: bool) -> Option<Finding> {
     let [x, y, z] = fit.moments.into();
     let coefficients = Vector3::new((y - z) / x, (z - x) / y, (x - y) / z);
     let is_body = fit.distinction < DISTINCT || nearest_body(&fit.moments).is_ok();
     let free = is_body && !leaves_motion(motion, &fit.r_squared);
     (!free).then(|| Finding::NotFree {
-        whole: true,
+        whole,
         r_squared: fit.r_squared,
         coefficients,
         closure: crate::model::closure(&coefficients),
         moments: fit.moments,
     })
+}
+
+/// Returns the finding about a body with a wheel.
+fn wheel(fit: &TensorFit, whole: bool) -> Option<Finding> {
+    let (largest, deviation) = fit.largest?;
+    if !whole && fit.distinction < DISTINCT {
+        return Some(Finding::Indistinct { whole, distinction: fit.distinction });
+    }
+    let shown = largest > 0.0 && largest.is_finite() && CERTAIN * deviation.unwrap_or(0.0) < largest;
+    (!shown).then_some(Finding::Wheel { whole, largest, deviation })
 }
 
 /// Returns true if the motion depends enough on a coefficient.
@@ -435,7 +473,7 @@ fn about_axes(fit: &AxesFit, found: &mut Vec<Finding>) {
 
 fn about_tensor(fit: &TensorFit, found: &mut Vec<Finding>) {
     if fit.distinction < DISTINCT {
-        found.push(Finding::Indistinct { distinction: fit.distinction });
+        found.push(Finding::Indistinct { whole: true, distinction: fit.distinction });
         return;
     }
     if let Some(deviation_per_s) = fit.damping_deviation_per_s {

@@ -48,11 +48,13 @@ pub(super) struct Sums {
     pub scatter: SMatrix<f64, FEATURES, FEATURES>,
     pub samples: u64,
     pub pieces: u64,
+    /// The momentum of the wheel, see [`Motion::with_wheel`].
+    pub wheel: Vector3<f64>,
 }
 
 impl Default for Sums {
     fn default() -> Self {
-        Self { scatter: SMatrix::zeros(), samples: 0, pieces: 0 }
+        Self { scatter: SMatrix::zeros(), samples: 0, pieces: 0, wheel: Vector3::zeros() }
     }
 }
 
@@ -88,6 +90,7 @@ pub struct Motion {
     third: (Vector3<f64>, u64),
     /// Σ ω ωᵀ.
     square: Matrix3<f64>,
+    pub(super) wheel: Vector3<f64>,
 }
 
 /// A summary of a log.
@@ -118,11 +121,23 @@ impl Default for Motion {
             in_row: 0,
             third: (Vector3::zeros(), 0),
             square: Matrix3::zeros(),
+            wheel: Vector3::zeros(),
         }
     }
 }
 
 impl Motion {
+    /// Creates the motion of a body with a wheel of constant momentum relative to it, in the sensor's axes. The moments of inertia
+    /// then have a scale: kg m² for N m s.
+    pub fn with_wheel(momentum: Vector3<f64>) -> Self {
+        Self { wheel: momentum, ..Self::default() }
+    }
+
+    /// Returns true if the body has a wheel.
+    pub fn has_wheel(&self) -> bool {
+        self.wheel != Vector3::zeros()
+    }
+
     /// Creates the motion of these segments, each of samples with increasing times.
     pub fn from_segments<'a>(segments: impl IntoIterator<Item = &'a [Sample]>) -> Self {
         let mut motion = Self::default();
@@ -199,7 +214,7 @@ impl Motion {
 
     /// Returns the sums over all pieces.
     pub(super) fn total(&self) -> Sums {
-        let mut total = Sums::default();
+        let mut total = Sums { wheel: self.wheel, ..Sums::default() };
         for group in &self.groups {
             total.scatter += group.scatter;
             total.samples += group.samples;

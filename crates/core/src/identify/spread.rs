@@ -26,6 +26,7 @@ pub(super) fn over_groups<const N: usize>(
             scatter: total.scatter - group.scatter,
             samples: total.samples - group.samples,
             pieces: total.pieces - group.pieces,
+            wheel: total.wheel,
         })
     };
     // Computed twice, to avoid storing every result.

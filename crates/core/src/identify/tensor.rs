@@ -5,6 +5,9 @@
 //! rad/s, so the squares are weighted by J⁻² of the last round. Noise of equal size on all rates contributes tr(J J⁻²
 //! J), the reference of the sum. So the smallest of six generalised eigenvalues is computed repeatedly: total least
 //! squares, which noise does not bias towards a sphere. The fit must not depend on a given noise or alignment.
+//!
+//! A wheel of momentum h adds (∫ω dt) × h. It has no noise of its own, so its share, the inverse of the scale of J, is
+//! eliminated like a mean.
 
 use super::motion::{FEATURES, Motion, PRODUCTS, SWEEPS, Sums, TURNS};
 use super::spread;
@@ -44,6 +47,9 @@ pub struct TensorFit {
     /// The ratio of the two smallest eigenvalues: how much worse the next tensor fits. Near 1 the motion does not
     /// determine the tensor.
     pub distinction: f64,
+    /// The largest moment with its standard deviation by resampling, if a wheel gives the scale: kg m² for N m s. It is negative
+    /// if the motion shows a wheel that turns the other way.
+    pub largest: Option<(f64, Option<f64>)>,
 }
 
 impl TensorFit {
@@ -59,6 +65,8 @@ pub(super) struct Solution {
     /// The tensor, of trace 1.
     pub tensor: Matrix3<f64>,
     damping: f64,
+    /// The factor of the wheel's momentum.
+    wheel: f64,
     distinction: f64,
 }
 
@@ -96,26 +104,29 @@ impl Motion {
         let total = self.total();
         let best = solve(&total, whole, damping)?;
         let (moments, axes) = principal(&best.tensor)?;
-        // The moments, then the directions by their part across the axis, then the damping.
+        // The moments, then the directions by their part across the axis, then the damping, then the inverse of the largest moment.
         let spread = spread::over_groups(self, |sums| {
             let solution = solve(sums, whole, damping)?;
             let (moments, own) = principal(&solution.tensor)?;
             let across = axes.transpose() * own;
-            Some(SVector::<f64, 10>::from_fn(|row, _| match row {
+            Some(SVector::<f64, 11>::from_fn(|row, _| match row {
                 0..3 => moments[row],
                 3..9 => {
                     let column = (row - 3) / 2;
                     across[((column + 1 + row % 2) % 3, column)]
                 }
-                _ => solution.damping,
+                9 => solution.damping,
+                _ => moments.sum() * solution.wheel,
             }))
         });
-        let direction = |spread: &SVector<f64, 10>| {
+        let direction = |spread: &SVector<f64, 11>| {
             Vector3::from_fn(|column, _| {
                 let (first, second) = (spread[3 + 2 * column], spread[4 + 2 * column]);
                 libm::sqrt(first * first + second * second)
             })
         };
+        let largest = 1.0 / (moments.sum() * best.wheel);
+        let largest = (largest, spread.map(|spread| spread[10] * largest * largest));
         Some(TensorFit {
             moments,
             deviation: spread.map(|spread| spread.fixed_rows::<3>(0).into_owned()),
@@ -125,6 +136,7 @@ impl Motion {
             damping_deviation_per_s: spread.map(|spread| spread[9]),
             r_squared: r_squared(&total, &best)?,
             distinction: best.distinction,
+            largest: self.has_wheel().then_some(largest),
         })
     }
 }
@@ -165,6 +177,13 @@ fn maps(tensor: &Matrix3<f64>) -> [Row; 2] {
     [free, damped]
 }
 
+/// Returns ∫ω dt × h as a map of the features.
+fn wheel_map(momentum: &Vector3<f64>) -> Row {
+    let mut map = Row::zeros();
+    map.fixed_columns_mut::<3>(TURNS).copy_from(&-momentum.cross_matrix());
+    map
+}
+
 pub(super) fn solve(sums: &Sums, whole: bool, with_damping: bool) -> Option<Solution> {
     let mut scatter = sums.scatter;
     scatter.fill_lower_triangle_with_upper_triangle();
@@ -183,19 +202,27 @@ pub(super) fn solve(sums: &Sums, whole: bool, with_damping: bool) -> Option<Solu
     // All products of the scatter that a round needs.
     let products =
         [free * scatter * free.transpose(), free * scatter * damped.transpose(), damped * scatter * damped.transpose()];
+    let wheel = wheel_map(&sums.wheel);
+    let wheel_products = [free, damped].map(|maps| maps * scatter * wheel.transpose());
+    let wheel_square = wheel * scatter * wheel.transpose();
     // The sum of weight · block over the block of two elements.
     let weighed = |product: &SMatrix<f64, 18, 18>, weight: &Matrix3<f64>, p: usize, q: usize| {
         product.fixed_view::<3, 3>(3 * p, 3 * q).dot(weight)
     };
-    let mut solution = Solution { tensor: Matrix3::identity() / 3.0, damping: 0.0, distinction: 0.0 };
+    let mut solution = Solution { tensor: Matrix3::identity() / 3.0, damping: 0.0, wheel: 0.0, distinction: 0.0 };
     for _ in 0..ROUNDS {
         let (weight, c) = (weight(&solution.tensor)?, solution.damping);
         let (mut left, mut right) = (Matrix6::zeros(), Matrix6::zeros());
+        let square = wheel_square.dot(&weight);
+        let per_square = |value: f64| if square > 0.0 { value / square } else { 0.0 };
+        let beside = |p: usize| wheel_products.map(|product| product.fixed_view::<3, 3>(3 * p, 0).dot(&weight));
+        let beside = [0, 1, 2, 3, 4, 5].map(beside);
+        let eliminated = beside.map(|[free, damped]| free + c * damped);
         for p in 0..unknowns {
             for q in 0..unknowns {
                 let [free, first, damped] = [0, 1, 2].map(|kind| weighed(&products[kind], &weight, p, q));
                 let second = weighed(&products[1], &weight, q, p);
-                left[(p, q)] = free + c * (first + second) + c * c * damped;
+                left[(p, q)] = free + c * (first + second) + c * c * damped - per_square(eliminated[p] * eliminated[q]);
                 right[(p, q)] = (elements[p] * weight).dot(&elements[q]);
             }
         }
@@ -212,16 +239,18 @@ pub(super) fn solve(sums: &Sums, whole: bool, with_damping: bool) -> Option<Solu
         }
         let (tensor, found) = (tensor / trace, found / trace);
         let change = (tensor - solution.tensor).amax();
-        let mut damping = 0.0;
+        let [free_wheel, damped_wheel] = [0, 1].map(|kind| (0..6).map(|p| found[p] * beside[p][kind]).sum::<f64>());
+        let (mut damping, mut wheel) = (0.0, -per_square(free_wheel));
         if with_damping {
             let sum = |kind: usize| {
                 let terms = (0..36).map(|pair| (pair / 6, pair % 6));
                 terms.map(|(p, q)| found[p] * found[q] * weighed(&products[kind], &weight, p, q)).sum::<f64>()
             };
-            let square = sum(2);
-            damping = if square > 0.0 { -sum(1) / square } else { 0.0 };
+            let apart = sum(2) - per_square(damped_wheel * damped_wheel);
+            damping = if apart > 0.0 { -(sum(1) + wheel * damped_wheel) / apart } else { 0.0 };
+            wheel -= damping * per_square(damped_wheel);
         }
-        solution = Solution { tensor, damping, distinction };
+        solution = Solution { tensor, damping, wheel, distinction };
         if change < SETTLED && (damping - c).abs() <= SETTLED * (1.0 + c.abs()) {
             break;
         }
@@ -289,7 +318,8 @@ pub(super) fn left(sums: &Sums, solution: &Solution) -> Option<Vector3<f64>> {
     let mut scatter = sums.scatter;
     scatter.fill_lower_triangle_with_upper_triangle();
     let [free, damped] = maps(&solution.tensor);
-    let left = solution.tensor.try_inverse()? * (free + damped * solution.damping);
+    let whole = free + damped * solution.damping + wheel_map(&sums.wheel) * solution.wheel;
+    let left = solution.tensor.try_inverse()? * whole;
     Some((left * scatter * left.transpose()).diagonal())
 }
 

@@ -185,6 +185,60 @@ fn rates_at_another_scale_are_found_by_the_identity() {
     assert!(has_no_scale(&scaled([0.99, 0.99, 1.0], 1.0, 0.01)) && !has_no_scale(&scaled([0.4, 0.8, 1.0], 1.0, 0.01)));
 }
 
+/// Returns segments of a body with a wheel, by Runge-Kutta steps, measured by a turned sensor.
+fn gyrostat(wheel: Vector3<f64>, turn: Rotation3<f64>, damping_per_s: f64, noise_rad_s: f64) -> Motion {
+    let moments = Vector3::new(0.03, 0.042, 0.05);
+    let slope = |rate: Vector3<f64>| -> Vector3<f64> {
+        -rate.cross(&(moments.component_mul(&rate) + wheel)).component_div(&moments) - damping_per_s * rate
+    };
+    let (mut noise, mut start) = (Noise::new(7, 0, [noise_rad_s; 3], [0.0; 3]), Noise::new(3, 1, [0.5; 3], [0.0; 3]));
+    let mut motion = Motion::with_wheel(turn * wheel);
+    for _ in 0..12 {
+        let mut rate = start.sample();
+        for tick in 0..300 {
+            motion.push(&Sample { time_s: f64::from(tick) * 0.05, rate_rad_s: turn * rate + noise.sample() });
+            for h in [0.025; 2] {
+                let first = slope(rate);
+                let second = slope(rate + first * (h / 2.0));
+                let third = slope(rate + second * (h / 2.0));
+                rate += (first + second * 2.0 + third * 2.0 + slope(rate + third * h)) * (h / 6.0);
+            }
+        }
+        motion.end_segment();
+    }
+    motion
+}
+
+#[test]
+fn a_wheel_gives_the_moments_their_scale() {
+    let wheel = Vector3::new(0.004, -0.006, 0.012);
+    for turn in [Rotation3::identity(), Rotation3::from_euler_angles(0.3, -0.2, 0.25)] {
+        for (damping_per_s, noise_rad_s) in [(0.0, 0.0), (0.03, 0.0), (0.03, 2e-3)] {
+            let motion = gyrostat(wheel, turn, damping_per_s, noise_rad_s);
+            let fit = motion.about_unknown_axes(true).unwrap();
+            let (largest, deviation) = fit.largest.unwrap();
+            let moments = fit.moments * largest;
+            assert!(
+                (moments - Vector3::new(0.03, 0.042, 0.05)).amax() < 2e-4,
+                "{damping_per_s} {noise_rad_s}: {fit:?}"
+            );
+            assert!((largest - 0.05).abs() < 4.0 * deviation.unwrap() + 1e-5, "{fit:?}");
+            assert!((fit.damping_per_s - damping_per_s).abs() < 2e-3, "{fit:?}");
+            let found = all_findings(&motion);
+            assert!(!found.iter().any(Finding::forbids_tensor) && !found.contains(&Finding::Scale), "{found:?}");
+            let turned = turn != Rotation3::identity();
+            assert_eq!(found.iter().any(Finding::forbids_axes), turned, "{found:?}");
+            assert_eq!(wrong_scale(&motion), None);
+        }
+    }
+    // One that turns the other way.
+    let mut reversed = gyrostat(wheel, Rotation3::identity(), 0.0, 0.0);
+    reversed.wheel = -wheel;
+    let found = all_findings(&reversed);
+    assert!(found.iter().any(|finding| matches!(finding, Finding::Wheel { whole: false, .. })), "{found:?}");
+    assert!(found.iter().any(Finding::forbids_tensor), "{found:?}");
+}
+
 #[test]
 fn an_empty_log_has_no_result() {
     let empty = Motion::default();

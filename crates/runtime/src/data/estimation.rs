@@ -9,6 +9,7 @@ use super::log::{Entry, Log};
 use super::plausible;
 use crate::estimate::{
     FilterKind, RateChoice, RateSurvey, Reconstructed, Reconstruction, ReconstructionError, Score, SegmentScore, Setup,
+    Wheel,
 };
 use crate::identify::{Motion, Sample};
 use nalgebra::{Matrix3, Vector3};
@@ -49,6 +50,8 @@ pub struct Request {
     pub coefficients: Vector3<f64>,
     /// Damping by a torque −c I ω, 1/s.
     pub damping_per_s: f64,
+    /// A wheel in the body, with its momentum in the sensor's axes.
+    pub wheel: Option<Wheel>,
     /// The principal axes as columns in the sensor's axes; `None` if both are the same.
     pub axes: Option<Matrix3<f64>>,
     /// The filter.
@@ -61,6 +64,17 @@ pub struct Request {
     pub guess_rad_s: Option<f64>,
     /// The level below which the measured rates carry no information, rad/s; ten times the noise of the log's start if `None`.
     pub floor_rad_s: Option<f64>,
+}
+
+impl Request {
+    /// Returns the wheel about the principal axes.
+    fn principal_wheel(&self) -> Option<Wheel> {
+        let turned = |wheel: Wheel| Wheel {
+            momentum: self.axes.map_or(wheel.momentum, |axes| axes.transpose() * wheel.momentum),
+            ..wheel
+        };
+        self.wheel.map(turned)
+    }
 }
 
 /// An error of an estimate.
@@ -178,6 +192,7 @@ pub fn estimate_log(
         coefficients: request.coefficients,
         axis: request.axis,
         damping_per_s: request.damping_per_s,
+        wheel: request.principal_wheel(),
         filter,
         guess_rad_s: request.guess_rad_s,
         floor_rad_s,
@@ -242,7 +257,8 @@ fn survey(
     principal: impl Fn(&Entry) -> Vector3<f64>,
 ) -> Result<(Vec<(Entry, Option<String>)>, RateSurvey), EstimateError> {
     let (mut head, mut survey) = (Vec::new(), RateSurvey::new(&request.coefficients, request.axis));
-    let mut motion = Motion::default();
+    let (mut motion, wheel) =
+        (Motion::with_wheel(request.wheel.map_or(Vector3::zeros(), |wheel| wheel.momentum)), request.principal_wheel());
     while head.len() < SURVEY_SAMPLES {
         let Some(entry) = log.next().transpose()? else { break };
         if entry.begins {
@@ -252,7 +268,9 @@ fn survey(
         if entry.rate_rad_s.iter().all(|rate| rate.is_finite()) {
             motion.push(&sample(&entry));
         }
-        survey.push(&Sample { rate_rad_s: principal(&entry), ..sample(&entry) });
+        let measured = principal(&entry);
+        let rate_rad_s = wheel.map_or(measured, |wheel| wheel.shifted(&measured, request.axis));
+        survey.push(&Sample { rate_rad_s, ..sample(&entry) });
         head.push((entry, entry.begins.then(|| log.segment_name())));
     }
     motion.end_segment();

@@ -8,6 +8,7 @@ use crate::identify::{
     AxesFit, Finding, Motion, MotionSummary, RecursiveAxisymmetricIdentifier, RecursiveFit, RecursiveIdentifier,
     Sample, TensorFit, findings, has_no_scale,
 };
+use nalgebra::Vector3;
 use std::path::{Path, PathBuf};
 
 /// The settings of an identification.
@@ -19,6 +20,8 @@ pub struct Ways {
     pub decay: Option<f64>,
     /// The axis of symmetry, 1 to 3, if the body is known to have one.
     pub symmetry_axis: Option<usize>,
+    /// The momentum of a wheel in the sensor's axes, N m s; zero without one.
+    pub wheel: Vector3<f64>,
 }
 
 /// A log that was read.
@@ -55,8 +58,8 @@ pub struct Identified {
     pub body: Option<TensorFit>,
     /// Least squares of the whole tensor.
     pub tensor: Option<TensorFit>,
-    /// The papers' filter.
-    pub recursive: RecursiveFit<3>,
+    /// The papers' filter; absent for a body with a wheel, which it does not know.
+    pub recursive: Option<RecursiveFit<3>>,
     /// The papers' filter for an axisymmetric body.
     pub axisymmetric: Option<RecursiveFit<1>>,
     /// The damping assumed by the recursive filters, 1/s.
@@ -73,7 +76,7 @@ pub struct Identified {
 pub fn identify_logs(paths: &[PathBuf], options: &Options, ways: &Ways) -> Result<Identified, DataError> {
     let all = Options { needed: [true; 3], ..options.clone() };
     let rereadable = paths.iter().all(|path| path.is_file());
-    let mut motion = Motion::default();
+    let mut motion = Motion::with_wheel(ways.wheel);
     let mut recursive = Filters::new(ways, 0.0)?;
     let mut logs = Vec::new();
     // The free motion of each log is found once.
@@ -100,7 +103,7 @@ pub fn identify_logs(paths: &[PathBuf], options: &Options, ways: &Ways) -> Resul
         findings.push(Finding::Units);
     }
     let mut recursive_damping_per_s = 0.0;
-    if rereadable {
+    if rereadable && !motion.has_wheel() {
         recursive_damping_per_s = body.map_or(0.0, |fit| fit.damping_per_s);
         recursive = Filters::new(ways, recursive_damping_per_s)?;
         for (path, all) in paths.iter().zip(&found) {
@@ -117,7 +120,7 @@ pub fn identify_logs(paths: &[PathBuf], options: &Options, ways: &Ways) -> Resul
         axes,
         body,
         tensor,
-        recursive: recursive.all.fit(),
+        recursive: (!motion.has_wheel()).then(|| recursive.all.fit()),
         axisymmetric: recursive.symmetric.map(|filter| filter.fit()),
         recursive_damping_per_s,
     })
