@@ -184,6 +184,12 @@ fn units_that_are_impossible_or_not_known_are_refused_by_name() {
             assert!(parts.iter().all(|part| refused.stderr.contains(part)), "{command:?}: {}", refused.stderr);
         }
     }
+    // With two rates, the third one follows from the body.
+    for (name, part) in [("slow-deg.csv", "--rate-unit deg/s"), ("slow-rpm.csv", "--rate-unit rpm")] {
+        let refused = bench.run(&[&["estimate", name, "--rates", "wx,wy,-"], &hidden[..]].concat());
+        assert!(refused.code == Some(1) && refused.says("implausible-unit"), "{name}: {refused:?}");
+        assert!(refused.stderr.contains(part), "{name}: {}", refused.stderr);
+    }
     // However the columns were chosen.
     let named = ["--rates", "Gyro X (gon/s),Gyro Y (gon/s),Gyro Z (gon/s)"];
     let refused = bench.run(&[&["identify", "gon.csv"], &named[..]].concat());

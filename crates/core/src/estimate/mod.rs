@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `reconstruction` | the hidden component, sample by sample |
 //! | `rate` | the choice of a decay rate for a log |
+//! | `scale` | the unit of two measured rates |
 //! | `score` | the comparison of the estimate with a measured component |
 //! | `wheel` | a body with a wheel as one without |
 //!
@@ -13,11 +14,15 @@
 mod rate;
 mod reconstruction;
 #[cfg(feature = "std")]
+mod scale;
+#[cfg(feature = "std")]
 mod score;
 mod wheel;
 
 pub use rate::{RateChoice, RateSurvey};
 pub use reconstruction::{FilterKind, Reconstructed, Reconstruction, ReconstructionError, Setup};
+#[cfg(feature = "std")]
+pub use scale::ScaleSurvey;
 #[cfg(feature = "std")]
 pub use score::{Score, SegmentScore};
 pub use wheel::Wheel;

@@ -13,7 +13,7 @@ const NEGLIGIBLE: f64 = 0.01;
 /// The deviation of a1 + a2 + a3 + a1 a2 a3 from 0, and of a coefficient beyond 1, from which no body has the coefficients.
 const OPEN: f64 = 0.1;
 /// Factors between rates in wrong units, of rate or time, and right ones: deg/s, mdps, mrad/s or ms, us, ns, rpm, rev/s.
-const SCALES: [f64; 7] = [
+pub(crate) const SCALES: [f64; 7] = [
     core::f64::consts::PI / 180.0,
     core::f64::consts::PI / 180e3,
     1e-3,

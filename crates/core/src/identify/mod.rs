@@ -25,6 +25,8 @@ mod tensor;
 
 pub use axes::AxesFit;
 #[cfg(feature = "std")]
+pub(crate) use findings::SCALES;
+#[cfg(feature = "std")]
 pub use findings::{Finding, findings, has_no_scale, wrong_scale};
 #[cfg(feature = "std")]
 pub use free::free_stretches;

@@ -104,6 +104,14 @@ pub struct Regressor {
     torque: [f64; 3],
 }
 
+impl Regressor {
+    /// Returns a_k ω_i ω_j, rad/s².
+    #[inline]
+    pub fn drift(&self) -> f64 {
+        self.drift
+    }
+}
+
 /// The length of a step with the weights of Hermite's rule, computed once for equal steps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Interval {

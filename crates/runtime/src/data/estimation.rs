@@ -8,8 +8,8 @@ use super::identification::{LogAccount, sample};
 use super::log::{Entry, Log};
 use super::plausible;
 use crate::estimate::{
-    FilterKind, RateChoice, RateSurvey, Reconstructed, Reconstruction, ReconstructionError, Score, SegmentScore, Setup,
-    Wheel,
+    FilterKind, RateChoice, RateSurvey, Reconstructed, Reconstruction, ReconstructionError, ScaleSurvey, Score,
+    SegmentScore, Setup, Wheel,
 };
 use crate::identify::{Motion, Sample};
 use nalgebra::{Matrix3, Vector3};
@@ -259,22 +259,30 @@ fn survey(
     let (mut head, mut survey) = (Vec::new(), RateSurvey::new(&request.coefficients, request.axis));
     let (mut motion, wheel) =
         (Motion::with_wheel(request.wheel.map_or(Vector3::zeros(), |wheel| wheel.momentum)), request.principal_wheel());
+    // Without a third rate, its course comes from the body.
+    let mut scale = ScaleSurvey::new(&request.coefficients, request.axis).filter(|_| wheel.is_none());
     while head.len() < SURVEY_SAMPLES {
         let Some(entry) = log.next().transpose()? else { break };
         if entry.begins {
             survey.end_segment();
             motion.end_segment();
-        }
-        if entry.rate_rad_s.iter().all(|rate| rate.is_finite()) {
-            motion.push(&sample(&entry));
+            scale.iter_mut().for_each(ScaleSurvey::end_segment);
         }
         let measured = principal(&entry);
+        if entry.rate_rad_s.iter().all(|rate| rate.is_finite()) {
+            motion.push(&sample(&entry));
+        } else if let Some(scale) = &mut scale {
+            scale.push(&Sample { rate_rad_s: measured, ..sample(&entry) });
+        }
         let rate_rad_s = wheel.map_or(measured, |wheel| wheel.shifted(&measured, request.axis));
         survey.push(&Sample { rate_rad_s, ..sample(&entry) });
         head.push((entry, entry.begins.then(|| log.segment_name())));
     }
     motion.end_segment();
+    scale.iter_mut().for_each(ScaleSurvey::end_segment);
     plausible::check_scale(log.path(), log.meaning(), &motion)?;
+    let two = scale.filter(|_| motion.summary().samples == 0);
+    plausible::check_factor(log.path(), log.meaning(), || two?.wrong_scale())?;
     Ok((head, survey))
 }
 

@@ -87,7 +87,15 @@ pub fn since_1970(units: i64) -> Option<TimeUnit> {
 /// # Errors
 /// [`DataError::Unit`].
 pub fn check_scale(path: &Path, meaning: &Meaning, motion: &Motion) -> Result<(), DataError> {
-    let factor = if meaning.assumed.is_empty() { None } else { wrong_scale(motion) };
+    check_factor(path, meaning, || wrong_scale(motion))
+}
+
+/// Checks the factor by which rates in assumed units are too small.
+///
+/// # Errors
+/// [`DataError::Unit`].
+pub fn check_factor(path: &Path, meaning: &Meaning, factor: impl FnOnce() -> Option<f64>) -> Result<(), DataError> {
+    let factor = if meaning.assumed.is_empty() { None } else { factor() };
     factor.map_or(Ok(()), |factor| Err(scaled(path, meaning, factor)))
 }
 
