@@ -1,5 +1,5 @@
-//! Notes what the program is made of, for its summaries and `--version`: the source revision and the target. The revision is that of
-//! the variable COROTATE_REVISION, of the package, or of git, and else `unknown`.
+//! Notes what the program is made of, for its summaries, `--version` and `new`: the source revision, the target, and the directory of the
+//! sources. The revision is that of the variable COROTATE_REVISION, of the package, or of git, and else `unknown`.
 
 use std::path::Path;
 use std::process::Command;
@@ -8,8 +8,11 @@ use std::process::Command;
 const SOURCES: [&str; 7] = ["build.rs", "Cargo.toml", "Cargo.lock", "bin", "config", "crates", "src"];
 
 fn main() {
-    // A package may lie in another repository.
+    // A package may lie in another repository. Its program is for other machines, which do not have these sources.
     let given = std::env::var("COROTATE_REVISION").ok().filter(|revision| !revision.is_empty());
+    if given.is_none() {
+        println!("cargo::rustc-env=COROTATE_SOURCES={}", std::env::var("CARGO_MANIFEST_DIR").expect("cargo sets it"));
+    }
     let revision = given.or_else(packaged).or_else(|| git(&["describe", "--always", "--dirty", "--abbrev=12"]));
     let revision = revision.unwrap_or("unknown".to_owned());
     let target = std::env::var("TARGET").unwrap_or("unknown".to_owned());

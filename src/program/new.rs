@@ -113,12 +113,13 @@ fn write_all(directory: &Path, name: &str, template: Template) -> io::Result<()>
 
 /// Returns the manifest. It depends on the sources of this program if they are on this machine, else on the published crate.
 fn manifest(name: &str) -> String {
-    let (version, sources) = (env!("CARGO_PKG_VERSION"), Path::new(env!("CARGO_MANIFEST_DIR")));
-    let own = std::fs::read_to_string(sources.join("Cargo.toml"));
+    let version = env!("CARGO_PKG_VERSION");
     let lines = ["name = \"corotate\"", &format!("version = \"{version}\"")];
-    let here = own.is_ok_and(|own| lines.iter().all(|wanted| own.lines().any(|line| line == *wanted)));
-    let from =
-        if here { format!("path = {:?}", sources.display().to_string()) } else { format!("version = \"{version}\"") };
+    let here = option_env!("COROTATE_SOURCES").filter(|sources| {
+        let own = std::fs::read_to_string(Path::new(sources).join("Cargo.toml"));
+        own.is_ok_and(|own| lines.iter().all(|wanted| own.lines().any(|line| line == *wanted)))
+    });
+    let from = here.map_or(format!("version = \"{version}\""), |sources| format!("path = {sources:?}"));
     format!(
         "[package]\nname = \"{name}\"\nversion = \"0.1.0\"\nedition = \"2024\"\npublish = false\n\n\
          [dependencies]\ncorotate = {{ {from} }}\nserde = {{ version = \"1\", features = [\"derive\"] }}\n\n\
