@@ -12,7 +12,7 @@ use crate::sample::Phase;
 use crate::system::tell;
 use std::sync::atomic::Ordering;
 
-/// Time without messages after which a host is silent, ns: it sends every [`STATUS_NS`].
+/// Time without messages after which a host is silent, ns: it sends every `STATUS_NS`.
 const SILENT_NS: u64 = 250_000_000;
 /// Time for which an ending host sends its final files, and for which the launching host waits for them, ns: since the last message of
 /// the other host, and in total.
