@@ -23,7 +23,7 @@ const LULL_NS: u64 = 50_000;
 /// Time from the receipt of a change to the first tick at which it may act, ns: longer than a role takes for a tick, and than this
 /// process is usually held up.
 const CHANGE_LEAD_NS: u64 = 3_000_000;
-/// The same for a run over several hosts, whose network the change must cross: relays repeat a lost message after 20 ms.
+/// The same for a run over several hosts: the change crosses their network, on which relays repeat a lost message after 20 ms.
 const CHANGE_LEAD_HOSTS_NS: u64 = 300_000_000;
 
 impl Supervisor<'_> {
