@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 import corotate
-from controllers import FRICTION_N_M_S, GAIN, INERTIA_KG_M2, Fails, cart_pole, feedback, motor_pair
+from controllers import FRICTION_N_M_S, GAIN, INERTIA_KG_M2, SOON_S, Fails, cart_pole, feedback, motor_pair
 
 ROOT = Path(__file__).resolve().parents[2]
 CONTROLLERS = {"cart-pole": cart_pole, "motor-pair": motor_pair}
-# Time in which a failure ends a run, s: 0.2 on an idle machine. The launcher's timeouts are longer.
-SOON_S = 2
 # The slowest mode of cart-pole at its equilibrium, 1/s, as in tests/runs/one_plant.rs.
 RATE_PER_S = 2.029456
 EVERYWHERE = pytest.mark.parametrize("clock, where", [
