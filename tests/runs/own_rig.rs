@@ -14,13 +14,17 @@ pub(super) fn program() -> &'static Path {
     PROGRAM.get_or_init(|| example("motor-pair"))
 }
 
-/// Builds an example as its author would, but in the same target directory, which has its dependencies.
+/// Builds an example in the same target directory, which has its dependencies.
 pub fn example(name: &str) -> PathBuf {
+    build(name, &root().join("examples").join(name), "--locked")
+}
+
+/// Builds the program of a crate in this profile; without optimisation, as `tests/run`, because that takes seconds instead of minutes.
+fn build(name: &str, directory: &Path, flag: &str) -> PathBuf {
     let profile = Path::new(env!("CARGO_BIN_EXE_corotate")).parent().unwrap();
-    let manifest = root().join("examples").join(name).join("Cargo.toml");
     let mut command = Command::new(env!("CARGO"));
-    command.args(["build", "--locked", "--manifest-path", manifest.to_str().unwrap()]);
-    command.args(["--target-dir", profile.parent().unwrap().to_str().unwrap()]);
+    command.args(["build", flag, "--config", &format!("profile.release.package.{name}.opt-level=0"), "--target-dir"]);
+    command.arg(profile.parent().unwrap()).arg("--manifest-path").arg(directory.join("Cargo.toml"));
     command.args((!cfg!(debug_assertions)).then_some("--release"));
     let built = command.output().unwrap();
     assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
@@ -129,8 +133,8 @@ fn record_replay_diff_export_and_report_work() {
 #[test]
 fn a_run_can_be_watched_and_a_killed_role_is_restarted() {
     let bench = Bench::with_program(program());
-    bench.run(&["run", "--clock", "in-process", "--duration", "1000", "--out", "whole"]).succeeded();
-    let running = bench.start(&["run", "--clock", "lockstep", "--duration", "1000", "--out", "killed"]);
+    bench.run(&["run", "--clock", "in-process", "--duration", "100", "--out", "whole"]).succeeded();
+    let running = bench.start(&["run", "--clock", "lockstep", "--duration", "100", "--out", "killed"]);
     // Wait until the screen shows a tick.
     let screen = await_some(|| {
         let screen = bench.run(&["watch", "--once", "1"]);
@@ -233,13 +237,7 @@ pub fn built(name: &str, source: &str, scenario: (&str, &str)) -> PathBuf {
     }
     std::fs::write(directory.join(scenario.0), scenario.1).unwrap();
     std::fs::write(directory.join("src/main.rs"), source).unwrap();
-    let mut command = Command::new(env!("CARGO"));
-    command.args(["build", "--manifest-path", directory.join("Cargo.toml").to_str().unwrap()]);
-    command.args(["--offline", "--target-dir", profile.parent().unwrap().to_str().unwrap()]);
-    command.args((!cfg!(debug_assertions)).then_some("--release"));
-    let built = command.output().unwrap();
-    assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
-    profile.join(name)
+    build(name, &directory, "--offline")
 }
 
 /// Builds a copy of the example whose law panics at tick 500 in the way that the variable `PANIC` selects.
