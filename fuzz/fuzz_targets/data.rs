@@ -9,7 +9,11 @@ use corotate::model::Inertia;
 use libfuzzer_sys::fuzz_target;
 use std::io::Cursor;
 
+/// One of this many inputs is fitted: a fit takes a thousand times as long as reading.
+const FITTED: usize = 16;
+
 fn read(bytes: Vec<u8>, options: &Options) {
+    let is_fitted = bytes.len() % FITTED == 0;
     let mut log = match Log::from_csv(Cursor::new(bytes), "fuzz.csv".as_ref(), options) {
         Ok(log) => log,
         Err(error) => return assert!(!error.to_string().is_empty()),
@@ -18,7 +22,8 @@ fn read(bytes: Vec<u8>, options: &Options) {
     let (mut motion, mut recursive, mut survey) =
         (Motion::default(), RecursiveIdentifier::new(None, 0.1), RateSurvey::new(&coefficients, 3));
     let filter = FilterKind::First { decay_per_s: 5.0 };
-    let setup = Setup { coefficients, axis: 3, damping_per_s: 0.1, wheel: None, filter, guess_rad_s: None, floor_rad_s: 1e-3 };
+    let setup =
+        Setup { coefficients, axis: 3, damping_per_s: 0.1, wheel: None, filter, guess_rad_s: None, floor_rad_s: 1e-3 };
     let mut reconstruction = Reconstruction::new(&setup).expect("the axis is observable");
     let mut last_s = f64::NEG_INFINITY;
     for entry in log.by_ref() {
@@ -39,10 +44,12 @@ fn read(bytes: Vec<u8>, options: &Options) {
         let _ = reconstruction.push(&sample);
     }
     motion.end_segment();
-    let (axes, tensor) = (motion.about_known_axes(true), motion.about_unknown_axes(true));
-    let body = motion.moments_about_known_axes(false);
     let _ = (recursive.fit(), survey.choose());
-    assert!(!findings(&motion, axes.as_ref(), body.as_ref(), tensor.as_ref()).is_empty());
+    if is_fitted {
+        let (axes, tensor) = (motion.about_known_axes(true), motion.about_unknown_axes(true));
+        let body = motion.moments_about_known_axes(false);
+        assert!(!findings(&motion, axes.as_ref(), body.as_ref(), tensor.as_ref()).is_empty());
+    }
     let counts = log.counts();
     assert_eq!(counts.rows, counts.used + counts.incomplete + counts.repeated + counts.outside);
 }

@@ -64,11 +64,9 @@ impl LogArguments {
     pub fn options(&self) -> Result<Options, DataError> {
         let cut = match (&self.segments, self.from.or(self.to)) {
             (Some(path), _) => Cut::Between(read_parts(path)?),
-            (None, Some(_)) => {
-                Cut::Between(vec![[self.from.unwrap_or(f64::NEG_INFINITY), self.to.unwrap_or(f64::INFINITY)]])
-            }
             (None, None) if self.find_free => Cut::Free,
             (None, None) => Cut::Whole,
+            _ => Cut::Between(vec![[self.from.unwrap_or(f64::NEG_INFINITY), self.to.unwrap_or(f64::INFINITY)]]),
         };
         Ok(Options {
             topic: self.topic.clone(),
@@ -78,10 +76,10 @@ impl LogArguments {
             rate_unit: self.rate_unit.or(self.rate_scale.map(RateUnit::Scale)),
             by: self.by.clone(),
             gap_s: self.gap,
-            header: !self.no_header,
+            unnamed: self.no_header,
             skip: self.skip,
-            needed: [true; 3],
             cut,
+            ..Options::default()
         })
     }
 }
@@ -133,6 +131,8 @@ pub fn axis(name: &str) -> Result<usize, String> {
     }
 }
 
+/// The reason why writing text needs no error.
+pub const TO_TEXT: &str = "writing to a string does not fail";
 /// The letters of the axes.
 pub const AXES: [&str; 3] = ["x", "y", "z"];
 
@@ -148,20 +148,21 @@ pub fn exit_of(error: &DataError) -> Exit {
 /// Writes the columns, units and counts of rows of a log.
 pub fn write_log(log: &LogAccount, text: &mut String) -> std::fmt::Result {
     let (meaning, counts) = (&log.meaning, &log.counts);
-    let found = if meaning.found.is_empty() { String::new() } else { format!(", {}", meaning.found) };
-    writeln!(
-        text,
-        "{}: {} of {} rows, {} segments{found}",
-        log.path.display(),
-        counts.used,
-        counts.rows,
-        counts.segments
-    )?;
+    let (path, found) = (log.path.display(), if meaning.found.is_empty() { "" } else { ", " });
+    let (used, rows, segments) = (counts.used, counts.rows, counts.segments);
+    writeln!(text, "{path}: {used} of {rows} rows, {segments} segments{found}{}", meaning.found)?;
     let assumed = |what: &str| if meaning.assumed.contains(&what) { " (assumed)" } else { "" };
     let ((time, time_unit), (rates, rate_unit)) = (&meaning.time, &meaning.rates);
     let (time_note, rate_note) = (assumed("time"), assumed("rate"));
-    let rates = rates.each_ref().map(|name| if name == "-" { "-".to_owned() } else { format!("`{name}`") }).join(", ");
-    writeln!(text, "  time from `{time}` in {time_unit}{time_note}; rates from {rates} in {rate_unit}{rate_note}")?;
+    let list = |names: &[String; 3]| {
+        names.each_ref().map(|name| if name == "-" { "-".to_owned() } else { format!("`{name}`") }).join(", ")
+    };
+    let free = meaning.forces.as_ref().map_or(String::new(), |names| format!("; free motion shown by {}", list(names)));
+    let rates = list(rates);
+    writeln!(
+        text,
+        "  time from `{time}` in {time_unit}{time_note}; rates from {rates} in {rate_unit}{rate_note}{free}"
+    )?;
     if let Some(parts) = &log.parts {
         let (used_s, whole_s) = (counts.used_s, counts.whole_s);
         writeln!(text, "  {used_s:.1} of {whole_s:.1} s read: [{}]", timeline(parts, whole_s))?;
@@ -204,6 +205,7 @@ pub fn log_json(log: &LogAccount) -> serde_json::Value {
         "rates": { "columns": log.meaning.rates.0, "unit": log.meaning.rates.1.to_string() },
         "assumed_units": log.meaning.assumed,
         "table": log.meaning.found,
+        "accelerometer": log.meaning.forces,
         "parts_s": log.parts.as_ref().map(|parts| parts.iter().map(|part| part.map(|s| s.is_finite().then_some(s)))
             .collect::<Vec<_>>()),
         "counts": log.counts,

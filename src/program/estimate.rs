@@ -1,6 +1,6 @@
 //! `corotate estimate`: estimates the rate about one axis of a body from a log of the other two.
 
-use super::data::{AXES, LogArguments, axis, exit_of, log_json, numbers, three, write_log};
+use super::data::{AXES, LogArguments, TO_TEXT, axis, exit_of, log_json, numbers, three, write_log};
 use super::output::{CommandResult, Exit, Failure, fail, harmless, say};
 use crate::data::{EstimateError, Estimated, Estimation, FilterOrder, Request, estimate_log};
 use crate::estimate::{FilterKind, SegmentScore, Wheel};
@@ -13,8 +13,8 @@ use crate::sample::FieldKind;
 use crate::system::remedy;
 use nalgebra::{Matrix3, Vector3};
 use serde_json::{Value, json};
-use std::fmt::Write as _;
-use std::io::{self, BufWriter, Write};
+use std::fmt::Write;
+use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
@@ -169,7 +169,8 @@ pub fn estimate(arguments: &Arguments) -> CommandResult {
         error => fail(exit(&error), error),
     })?;
     table.map_or(Ok(()), Table::end).map_err(|error| unwritten(&arguments.table, error))?;
-    let results = results_text(&request, &estimation);
+    let mut results = String::new();
+    write_results(&request, &estimation, &mut results).expect(TO_TEXT);
     if let (Some(page), Some(path)) = (page, &arguments.page) {
         let facts = HiddenFacts {
             title: arguments.data.display().to_string(),
@@ -205,7 +206,11 @@ fn useless(estimation: &Estimation) -> Option<Failure> {
     Some(match 2 * too_long > unobserved {
         true => Failure::new("steps-too-long", format!("no estimate: {TOO_LONG}")),
         false => {
-            Failure::new("never-observed", "no estimate: the measured rates are too small at every sample; see --floor")
+            let floor = estimation.floor_rad_s;
+            let remedy = "give --floor, otherwise ten times the noise of the log's start, or take out outliers there";
+            let reason =
+                format!("no estimate: both measured rates are below {floor:.2e} rad/s at every sample; {remedy}");
+            Failure::new("never-observed", reason)
         }
     })
 }
@@ -291,7 +296,7 @@ const COLUMNS: [(&str, FieldKind); 7] = [
 
 /// A writer of rows with estimates.
 enum Table {
-    Csv(BufWriter<files::Created>),
+    Csv(Box<csv::Writer<files::Created>>),
     #[cfg(feature = "parquet")]
     Parquet(Box<RowGroups<files::Created>>),
 }
@@ -301,10 +306,9 @@ impl Table {
         if is_parquet(path) {
             return Self::begin_parquet(path);
         }
-        let mut out = BufWriter::new(files::create(path)?);
-        let names = COLUMNS.map(|(name, _)| name).join(",");
-        writeln!(out, "segment,{names}")?;
-        Ok(Self::Csv(out))
+        let mut out = csv::Writer::from_writer(files::create(path)?);
+        out.write_record(["segment"].into_iter().chain(COLUMNS.map(|(name, _)| name)))?;
+        Ok(Self::Csv(Box::new(out)))
     }
 
     #[cfg(feature = "parquet")]
@@ -334,11 +338,9 @@ impl Table {
         let observed = u64::from(row.estimate.observed);
         match self {
             Self::Csv(out) => {
-                write!(out, "{},{}", quoted(segment), row.entry.row)?;
-                for value in numbers {
-                    if value.is_finite() { write!(out, ",{value:?}")? } else { write!(out, ",")? }
-                }
-                writeln!(out, ",{observed}")
+                let text = |value: f64| if value.is_finite() { format!("{value:?}") } else { String::new() };
+                let cells = [segment.to_owned(), row.entry.row.to_string()].into_iter().chain(numbers.map(text));
+                Ok(out.write_record(cells.chain([observed.to_string()]))?)
             }
             #[cfg(feature = "parquet")]
             Self::Parquet(groups) => {
@@ -361,11 +363,6 @@ impl Table {
 /// Returns true if the table's name ends in .parquet.
 fn is_parquet(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("parquet"))
-}
-
-/// Returns a name as a cell of CSV.
-fn quoted(name: &str) -> String {
-    if name.contains([',', '"', '\n', '\r']) { format!("\"{}\"", name.replace('"', "\"\"")) } else { name.to_owned() }
 }
 
 /// Returns median and 90th percentile of the finite values; `None` without any.
@@ -408,12 +405,6 @@ fn percent(part: f64) -> String {
 /// Returns a part of the text without its indents, one sentence per line; a deeper indent continues a sentence.
 fn paragraph(part: &str) -> String {
     part.trim().replace("\n    ", " ").replace("\n  ", "\n")
-}
-
-fn results_text(request: &Request, estimation: &Estimation) -> String {
-    let mut text = String::new();
-    write_results(request, estimation, &mut text).expect("writing to a string does not fail");
-    text
 }
 
 fn write_results(request: &Request, estimation: &Estimation, text: &mut String) -> std::fmt::Result {
@@ -467,40 +458,27 @@ fn write_results(request: &Request, estimation: &Estimation, text: &mut String) 
         )?;
     }
     match overall(&estimation.segments) {
-        Some(overall) => {
+        Some(Overall { error_rad_s, measured_rad_s, part, scored }) => {
+            let ([error, worst], [share, most]) = (error_rad_s.map(figure), part.map(percent));
             writeln!(
                 text,
-                "\nrms error over the second half of {} segments: median {}, 90th percentile {} rad/s",
-                overall.scored,
-                figure(overall.error_rad_s[0]),
-                figure(overall.error_rad_s[1])
+                "\nrms error over the second half of {scored} segments: median {error}, 90th percentile {worst} rad/s\n  \
+                 relative to the rate, {measured_rad_s:.3} rad/s rms (median): median {share} %, 90th percentile {most} %"
             )?;
-            writeln!(
-                text,
-                "  relative to the rate, {:.3} rad/s rms (median): median {} %, 90th percentile {} %",
-                overall.measured_rad_s,
-                percent(overall.part[0]),
-                percent(overall.part[1])
-            )?;
-            if overall.part[0] > MISFIT {
-                writeln!(
-                    text,
-                    "note: the body does not fit this motion: its axes, its moments, its damping or a unit is another"
-                )?;
+            if part[0] > MISFIT {
+                text.push_str("note: the body does not fit this motion: its axes, its moments, its damping or a unit is another\n");
             }
+            for (name, score) in estimation.segments.iter().filter(|_| estimation.segments.len() <= LISTED) {
+                let (error, measured) = (score.error_rad_s, score.measured_rad_s);
+                writeln!(text, "  {name}: {} of {measured:.3} rad/s, {} samples", figure(error), score.samples)?;
+            }
+            Ok(())
         }
         None if estimation.log.meaning.rates.0[request.axis - 1] == "-" => {
-            writeln!(text, "\nno score: the log lacks the rate about {hidden}")?;
+            writeln!(text, "\nno score: the log lacks the rate about {hidden}")
         }
-        None => writeln!(text, "\nno score: no sample has both an estimate and a measured rate about {hidden}")?,
+        None => writeln!(text, "\nno score: no sample has both an estimate and a measured rate about {hidden}"),
     }
-    if overall(&estimation.segments).is_some() && estimation.segments.len() <= LISTED {
-        for (name, score) in &estimation.segments {
-            let (error, measured) = (score.error_rad_s, score.measured_rad_s);
-            writeln!(text, "  {name}: {} of {measured:.3} rad/s, {} samples", figure(error), score.samples)?;
-        }
-    }
-    Ok(())
 }
 
 fn to_json(request: &Request, estimation: &Estimation) -> Value {

@@ -1,10 +1,11 @@
 //! `corotate identify`: identifies a body's inertia from logs of its angular velocity.
 
-use super::data::{AXES, LogArguments, axis, exit_of, log_json, three, write_log};
+use super::data::{AXES, LogArguments, TO_TEXT, axis, exit_of, log_json, three, write_log};
 use super::output::{CommandResult, Exit, Failure, fail, harmless, say};
 use crate::data::{Identified, Ways, identify_logs};
 use crate::identify::{AxesFit, Finding, RecursiveFit, TensorFit, nearest_body};
 use crate::observe::InertiaRatios;
+use clap::ValueEnum;
 use nalgebra::{Matrix3, SVector, Vector3};
 use serde_json::{Value, json};
 use std::fmt::Write;
@@ -77,16 +78,12 @@ struct Body {
 
 /// Executes `corotate identify`.
 pub fn identify(arguments: &Arguments) -> CommandResult {
-    let axisymmetric = arguments.method == Method::Axisymmetric;
-    if axisymmetric && arguments.symmetry_axis.is_none() {
-        return Err(fail(
-            Exit::Usage,
-            Failure::new("missing-axis", "--method axisymmetric lacks an axis; add --symmetry-axis x, y or z"),
-        ));
+    let refuse = |code, reason| Err(fail(Exit::Usage, Failure::new(code, reason)));
+    if arguments.method == Method::Axisymmetric && arguments.symmetry_axis.is_none() {
+        return refuse("missing-axis", "--method axisymmetric lacks an axis; add --symmetry-axis x, y or z");
     }
     if arguments.wheel.is_some() && !matches!(arguments.method, Method::Axes | Method::Tensor) {
-        let reason = "the papers' filters know no wheel; give --method axes or tensor";
-        return Err(fail(Exit::Usage, Failure::new("wheel-not-modelled", reason)));
+        return refuse("wheel-not-modelled", "the papers' filters know no wheel; give --method axes or tensor");
     }
     let ways = Ways {
         damping: !arguments.no_damping,
@@ -100,7 +97,11 @@ pub fn identify(arguments: &Arguments) -> CommandResult {
     let body = body(arguments, &identified);
     let text = match arguments.json {
         true => format!("{}\n", to_json(arguments, &identified, body.as_ref().ok())),
-        false => harmless(&results_text(arguments, &identified, body.as_ref().ok())),
+        false => {
+            let mut text = String::new();
+            write_results(arguments, &identified, body.as_ref().ok(), &mut text).expect(TO_TEXT);
+            harmless(&text)
+        }
     };
     say(&text)?;
     body.map(|_| Exit::Ok).map_err(|failure| fail(Exit::Failure, failure))
@@ -154,12 +155,6 @@ fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, Failure>
     Ok(Body { moments, ..found })
 }
 
-fn results_text(arguments: &Arguments, identified: &Identified, body: Option<&Body>) -> String {
-    let mut text = String::new();
-    write_results(arguments, identified, body, &mut text).expect("writing to a string does not fail");
-    text
-}
-
 fn write_results(
     arguments: &Arguments,
     identified: &Identified,
@@ -201,27 +196,17 @@ fn write_results(
     }
     writeln!(text)?;
     identified.findings.iter().try_for_each(|finding| writeln!(text, "note: {finding}"))?;
-    match body {
-        Some(body) => {
-            let [x, y, z] = body.moments.into();
-            let method = name(arguments.method);
-            match arguments.wheel {
-                Some(_) => writeln!(text, "\ninertia_kg_m2 = [{x:.5e}, {y:.5e}, {z:.5e}]   # method {method}"),
-                None => writeln!(text, "\ninertia_kg_m2 = [{x:.6}, {y:.6}, {z:.6}]   # ratios only; method {method}"),
-            }
-        }
-        None => Ok(()),
+    let Some(body) = body else { return Ok(()) };
+    let ([x, y, z], method) = (body.moments.into(), name(arguments.method));
+    match arguments.wheel {
+        Some(_) => writeln!(text, "\ninertia_kg_m2 = [{x:.5e}, {y:.5e}, {z:.5e}]   # method {method}"),
+        None => writeln!(text, "\ninertia_kg_m2 = [{x:.6}, {y:.6}, {z:.6}]   # ratios only; method {method}"),
     }
 }
 
 /// Returns the name of a method on the command line.
-fn name(method: Method) -> &'static str {
-    match method {
-        Method::Axes => "axes",
-        Method::Tensor => "tensor",
-        Method::Recursive => "recursive",
-        Method::Axisymmetric => "axisymmetric",
-    }
+fn name(method: Method) -> String {
+    method.to_possible_value().map_or(String::new(), |value| value.get_name().to_owned())
 }
 
 fn memory_text(arguments: &Arguments, identified: &Identified) -> String {
@@ -298,12 +283,13 @@ fn deviations<const N: usize>(values: Option<&SVector<f64, N>>, text: &mut Strin
 
 fn to_json(arguments: &Arguments, identified: &Identified, body: Option<&Body>) -> Value {
     let account = &identified.account;
+    let steps = |[used, unexcited, ambiguous]: &[u64; 3]| json!({ "used": used, "unexcited": unexcited, "ambiguous": ambiguous });
     let recursive = |fit: &RecursiveFit<3>| {
         json!({
             "coefficients": triple(&fit.coefficients),
             "deviation_per_rad_s": fit.deviation_per_rad_s.as_ref().map(triple),
             "excitation": fit.excitation,
-            "steps": { "used": fit.steps[0], "unexcited": fit.steps[1], "ambiguous": fit.steps[2] },
+            "steps": steps(&fit.steps),
             "damping_taken_per_s": identified.recursive_damping_per_s,
         })
     };
@@ -332,7 +318,7 @@ fn to_json(arguments: &Arguments, identified: &Identified, body: Option<&Body>) 
             "coefficient": fit.coefficients.x,
             "deviation_per_rad_s": fit.deviation_per_rad_s.map(|deviation| deviation.x),
             "excitation_rad": fit.excitation,
-            "steps": { "used": fit.steps[0], "unexcited": fit.steps[1], "ambiguous": fit.steps[2] },
+            "steps": steps(&fit.steps),
         })),
         "findings": identified.findings.iter().map(ToString::to_string).collect::<Vec<_>>(),
         "body": body.map(|body| json!({

@@ -3,9 +3,12 @@
 use crate::common::Bench;
 use corotate::model::{Inertia, Noise, RigidBody};
 use nalgebra::Vector3;
+use serde_json::Value;
 use std::fmt::Write;
 
 const MOMENTS: [f64; 3] = [0.4, 0.8, 1.0];
+/// A header with units.
+const KNOWN: &str = "t_s,wx_rad_s,wy_rad_s,wz_rad_s\n";
 
 /// Returns time and rates of a free motion, s and rad/s, at 100 Hz.
 fn motion(samples: u32) -> Vec<[f64; 4]> {
@@ -33,6 +36,18 @@ fn plain(head: &str, rad_s: f64) -> String {
 
 fn in_deg(head: &str) -> String {
     plain(head, std::f64::consts::PI / 180.0)
+}
+
+/// Writes a table of the given rows.
+fn rows(head: &str, rows: impl IntoIterator<Item = [f64; 4]>) -> String {
+    rows.into_iter().fold(head.to_owned(), |text, [t, x, y, z]| text + &format!("{t:.6},{x:.9},{y:.9},{z:.9}\n"))
+}
+
+/// Asserts that the body was found.
+fn assert_body(found: &Value, tolerance: f64, about: &str) {
+    for (moment, expected) in found["body"]["inertia_kg_m2"].as_array().unwrap().iter().zip(MOMENTS) {
+        assert!((moment.as_f64().unwrap() - expected).abs() < tolerance, "{about}: {found:#}");
+    }
 }
 
 /// Returns a text in Latin-1.
@@ -101,27 +116,22 @@ fn tables_of_many_forms_give_the_body_at_the_first_try() {
         std::fs::write(bench.path(name), bytes).unwrap();
         let done = bench.run(&["identify", name, "--json"]);
         assert_eq!(done.code, Some(0), "{name}: {}", done.stderr);
-        let found = done.json();
-        for (moment, expected) in found["body"]["inertia_kg_m2"].as_array().unwrap().iter().zip(MOMENTS) {
-            assert!((moment.as_f64().unwrap() - expected).abs() < 0.01, "{name}: {found:#}");
-        }
+        assert_body(&done.json(), 0.01, name);
     }
-    let commas = plain("\"Time, s\",\"IMU, X\",\"IMU, Y\",\"IMU, Z\"\n", 1.0);
-    std::fs::write(bench.path("commas.csv"), commas).unwrap();
-    assert!(bench.run(&["identify", "commas.csv"]).says("no-such-column"));
-    let found = bench.run(&["identify", "commas.csv", "--json", "--rates", "2,3,4"]).succeeded().json();
-    assert!((found["body"]["inertia_kg_m2"][0].as_f64().unwrap() - 0.4).abs() < 0.01, "{found:#}");
     // The options for what is not found out.
     let counted =
         table("PacketCounter,IMU A,IMU B,IMU C\n", 1.0, |t, rates| format!("{:.0},{}", t * 100.0, rates.join(",")));
-    std::fs::write(bench.path("counter.csv"), format!("1,2,3,4\n1,2,3,4\n{counted}")).unwrap();
-    let options = ["--skip", "2", "--time", "1", "--rates", "imu a,IMU B,4", "--rate-hz", "100"];
-    let found = bench.run(&[&["identify", "counter.csv", "--json"], &options[..]].concat()).succeeded().json();
-    assert!((found["body"]["inertia_kg_m2"][0].as_f64().unwrap() - 0.4).abs() < 0.01, "{found:#}");
-    let scaled = plain("t_s,gyro_x (lsb),gyro_y (lsb),gyro_z (lsb)\n", 0.001);
-    std::fs::write(bench.path("lsb.csv"), scaled).unwrap();
-    let found = bench.run(&["identify", "lsb.csv", "--json", "--rate-scale", "0.001"]).succeeded().json();
-    assert!((found["body"]["inertia_kg_m2"][0].as_f64().unwrap() - 0.4).abs() < 0.01, "{found:#}");
+    let counter = ["--skip", "2", "--time", "1", "--rates", "imu a,IMU B,4", "--rate-hz", "100"];
+    for (text, code, options) in [
+        (plain("\"Time, s\",\"IMU, X\",\"IMU, Y\",\"IMU, Z\"\n", 1.0), "no-such-column", &["--rates", "2,3,4"][..]),
+        (format!("1,2,3,4\n1,2,3,4\n{counted}"), "no-such-column", &counter),
+        (plain("t_s,gyro_x (lsb),gyro_y (lsb),gyro_z (lsb)\n", 1e-3), "unknown-unit", &["--rate-scale", "0.001"]),
+    ] {
+        std::fs::write(bench.path("log.csv"), text).unwrap();
+        assert!(bench.run(&["identify", "log.csv"]).says(code));
+        let found = bench.run(&[&["identify", "log.csv", "--json"], options].concat()).succeeded().json();
+        assert_body(&found, 0.01, code);
+    }
 }
 
 #[test]
@@ -149,11 +159,9 @@ fn units_that_are_impossible_or_not_known_are_refused_by_name() {
     let millis = |head: &str| table(head, 1.0, |t, rates| format!("{:.0},{}", t * 1e3, rates.join(",")));
     // A slow body turns by little between samples in wrong units too; only its motion shows them.
     let slow = |rad_s: f64, per_second: f64| {
-        motion(400).into_iter().fold("t,wx,wy,wz\n".to_owned(), |mut text, [t, x, y, z]| {
-            let [x, y, z] = [x, y, z].map(|rate| 0.02 * rate / rad_s);
-            writeln!(text, "{:.6},{x:.9},{y:.9},{z:.9}", t * 50.0 * per_second).unwrap();
-            text
-        })
+        let slowed =
+            |[t, x, y, z]: [f64; 4]| [t * 50.0 * per_second, 0.02 * x / rad_s, 0.02 * y / rad_s, 0.02 * z / rad_s];
+        rows("t,wx,wy,wz\n", motion(400).into_iter().map(slowed))
     };
     let deg = std::f64::consts::PI / 180.0;
     let hidden = ["--hidden", "z", "--inertia", ".4,.8,1"];
@@ -209,28 +217,23 @@ fn units_that_are_impossible_or_not_known_are_refused_by_name() {
 fn a_motion_that_is_not_free_gives_no_body_in_a_short_log_too() {
     let bench = Bench::new();
     let wave = |t: f64| [t, 0.0, 0.0, 5.0 * (2.0 * t).sin()];
-    for (name, rates) in [
+    for (name, motion) in [
         ("swing.csv", wave as fn(f64) -> [f64; 4]),
         ("constant.csv", |t| [t, 1.0, 2.0, 3.0]),
         ("slowing.csv", |t| [t, 5.0 * (-t).exp(), 3.0 * (-t).exp(), 4.0 * (-t).exp()]),
     ] {
-        let mut text = String::from("time_s,wx_rad_s,wy_rad_s,wz_rad_s\n");
-        for [t, x, y, z] in (0..300).map(|tick| rates(f64::from(tick) * 0.01)) {
-            writeln!(text, "{t:.2},{x:.4},{y:.4},{z:.4}").unwrap();
-        }
+        let text = rows(KNOWN, (0..300).map(|tick| motion(f64::from(tick) * 0.01)));
         std::fs::write(bench.path(name), text).unwrap();
         let refused = bench.run(&["identify", name]);
         assert!(refused.code == Some(1) && refused.says("one-axis"), "{name}: {refused:?}");
         assert!(!refused.stdout.contains("inertia_kg_m2"), "{name}: {refused:?}");
     }
     for (name, samples, step_s) in [("short.csv", 60, 0.05), ("long.csv", 3000, 0.01), ("fast.csv", 100, 0.02)] {
-        let mut text = String::from("time_s,wx_rad_s,wy_rad_s,wz_rad_s\n");
-        for tick in 0..samples {
+        let driven = |tick| {
             let t = f64::from(tick) * step_s;
-            let rates = [1.0 + (3.0 * t).sin(), (2.3 * t).sin() + 0.2 * (5.1 * t).cos(), 4.0 + (1.7 * t).cos()];
-            writeln!(text, "{t:.2},{:.4},{:.4},{:.4}", rates[0], rates[1], rates[2]).unwrap();
-        }
-        std::fs::write(bench.path(name), text).unwrap();
+            [t, 1.0 + (3.0 * t).sin(), (2.3 * t).sin() + 0.2 * (5.1 * t).cos(), 4.0 + (1.7 * t).cos()]
+        };
+        std::fs::write(bench.path(name), rows(KNOWN, (0..samples).map(driven))).unwrap();
         for method in ["axes", "tensor", "recursive"] {
             let refused = bench.run(&["identify", name, "--method", method]);
             assert!(refused.code == Some(1) && refused.says("not-free"), "{name} {method}: {refused:?}");
@@ -245,7 +248,7 @@ fn a_motion_that_is_not_free_gives_no_body_in_a_short_log_too() {
 fn thrown(accelerometer: bool) -> String {
     let (body, moments) = (RigidBody::new(&Inertia::new(MOMENTS).unwrap()), Vector3::from(MOMENTS));
     let (place, mut noise) = (Vector3::new(0.02, -0.01, 0.01), Noise::new(5, 0, [0.5; 3], [0.0; 3]));
-    let mut text = format!("t_s,wx_rad_s,wy_rad_s,wz_rad_s{}\n", if accelerometer { ",ax,ay,az" } else { "" });
+    let mut text = KNOWN.trim_end().to_owned() + if accelerometer { ",ax,ay,az\n" } else { "\n" };
     let mut rows = 0;
     for throw in 0..5 {
         let (mut rate, mut angle) = (Vector3::new(8.0, 1.0 + f64::from(throw), 6.0), 0.0);
@@ -287,13 +290,17 @@ fn an_accelerometer_shows_the_free_motion_that_noise_hides() {
         let found = done.succeeded().json();
         let parts = found["logs"][0]["parts_s"].as_array().unwrap();
         assert_eq!(parts.len(), 5, "{parts:?}");
+        assert_eq!(found["logs"][0]["accelerometer"], serde_json::json!(["ax", "ay", "az"]));
+        let estimate = ["estimate", "thrown.csv", "--find-free", "--hidden", "z", "--inertia", "0.4,0.8,1"];
+        for command in [&["identify", "thrown.csv", "--find-free", "--method", "tensor"][..], &estimate] {
+            let shown = bench.run(command).succeeded().stdout;
+            assert!(shown.contains("free motion shown by `ax`, `ay`, `az`\n"), "{shown}");
+        }
         for (part, throw) in parts.iter().zip(0..) {
             let ends = [0, 1].map(|end| part[end].as_f64().unwrap() - 2.4 * f64::from(throw));
             assert!((ends[0] - 1.0).abs() < 0.1 && (ends[1] - 1.8).abs() < 0.1, "{parts:?}");
         }
-        for (moment, expected) in found["body"]["inertia_kg_m2"].as_array().unwrap().iter().zip(MOMENTS) {
-            assert!((moment.as_f64().unwrap() - expected).abs() < 0.05, "{found:#}");
-        }
+        assert_body(&found, 0.05, "thrown");
     }
 }
 
@@ -351,14 +358,9 @@ fn a_wheel_is_part_of_the_model_and_gives_the_moments_their_scale() {
 #[test]
 fn an_estimate_tells_why_it_is_useless() {
     let bench = Bench::new();
-    std::fs::write(bench.path("good.csv"), plain("t_s,wx_rad_s,wy_rad_s,wz_rad_s\n", 1.0)).unwrap();
+    std::fs::write(bench.path("good.csv"), plain(KNOWN, 1.0)).unwrap();
     // Every 40th sample of a motion of 10 rad/s.
-    let coarse =
-        motion(4000).into_iter().step_by(40).fold("t_s,wx_rad_s,wy_rad_s,wz_rad_s\n".to_owned(), |mut text, row| {
-            writeln!(text, "{:.2},{:.5},{:.5},{:.5}", row[0], row[1], row[2], row[3]).unwrap();
-            text
-        });
-    std::fs::write(bench.path("coarse.csv"), coarse).unwrap();
+    std::fs::write(bench.path("coarse.csv"), rows(KNOWN, motion(4000).into_iter().step_by(40))).unwrap();
     let estimate = |log: &str, more: &[&str]| bench.run(&[&["estimate", log, "--hidden", "x"], more].concat());
     let diverged = estimate("good.csv", &["--inertia", "0.4,0.8,1", "--damping=-60"]);
     assert!(diverged.code == Some(1) && diverged.says("diverged"), "{diverged:?}");
@@ -378,11 +380,11 @@ fn a_log_is_cut_by_times_by_a_file_and_by_its_free_motion() {
     let bench = Bench::new();
     let body = RigidBody::new(&Inertia::new(MOMENTS).unwrap());
     // Throws at different rates, with hand motions of two seconds between them.
-    let (mut text, mut parts, mut time_s) = (String::from("t_s,wx_rad_s,wy_rad_s,wz_rad_s\n"), String::new(), 0.0);
+    let (mut samples, mut parts) = (Vec::new(), String::new());
     let mut push = |rate: Vector3<f64>| {
-        writeln!(text, "{time_s:.2},{:.4},{:.4},{:.4}", rate.x, rate.y, rate.z).unwrap();
-        time_s += 0.01;
-        time_s - 0.01
+        let time_s = samples.len() as f64 * 0.01;
+        samples.push([time_s, rate.x, rate.y, rate.z]);
+        time_s
     };
     for throw in 0..12_u32 {
         let phase = f64::from(throw) * 1.7;
@@ -402,14 +404,11 @@ fn a_log_is_cut_by_times_by_a_file_and_by_its_free_motion() {
         });
         writeln!(parts, "{begin_s:.2},{end_s:.2}").unwrap();
     }
-    std::fs::write(bench.path("uncut.csv"), text).unwrap();
+    std::fs::write(bench.path("uncut.csv"), rows(KNOWN, samples.iter().copied())).unwrap();
+    std::fs::write(bench.path("hand.csv"), rows(KNOWN, samples.into_iter().take(200))).unwrap();
     std::fs::write(bench.path("parts.csv"), format!("begin,end\n{parts}")).unwrap();
-    let numbered = parts.lines().enumerate().map(|(number, part)| format!("{number},{part},,free\n"));
-    std::fs::write(
-        bench.path("numbered.csv"),
-        format!("segment,start,end,keep,comment\n{}", numbered.collect::<String>()),
-    )
-    .unwrap();
+    let numbered: String = parts.lines().zip(0..).map(|(part, number)| format!("{number},{part},,free\n")).collect();
+    std::fs::write(bench.path("numbered.csv"), "segment,start,end,keep,comment\n".to_owned() + &numbered).unwrap();
     let whole = bench.run(&["identify", "uncut.csv"]);
     assert!(whole.code == Some(1) && whole.says("not-free"), "{whole:?}");
     let first: Vec<&str> = parts.lines().next().unwrap().split(',').collect();
@@ -421,13 +420,10 @@ fn a_log_is_cut_by_times_by_a_file_and_by_its_free_motion() {
     ] {
         let found = bench.run(&[&["identify", "uncut.csv", "--json"], options].concat()).succeeded().json();
         let log = &found["logs"][0];
-        assert_eq!(
-            (log["counts"]["segments"].as_u64(), log["parts_s"].as_array().unwrap().len()),
-            (Some(segments), segments as usize)
-        );
-        for (moment, expected) in found["body"]["inertia_kg_m2"].as_array().unwrap().iter().zip(MOMENTS) {
-            assert!((moment.as_f64().unwrap() / expected - 1.0).abs() < 0.02, "{options:?}: {found:#}");
-        }
+        assert!(log["accelerometer"].is_null());
+        let found_parts = log["parts_s"].as_array().unwrap().len() as u64;
+        assert_eq!((&log["counts"]["segments"], found_parts), (&segments.into(), segments));
+        assert_body(&found, 0.01, options[0]);
         let used_s = log["counts"]["used_s"].as_f64().unwrap();
         assert!((used_s / (0.79 * segments as f64) - 1.0).abs() < 0.25, "{options:?}: {used_s}");
         bench
@@ -445,12 +441,6 @@ fn a_log_is_cut_by_times_by_a_file_and_by_its_free_motion() {
         let refused = bench.run(&[&["identify", "uncut.csv"], options].concat());
         assert!(code == "no-rows-used" && refused.code == Some(1) || refused.says(code), "{options:?}: {refused:?}");
     }
-    let hand: String = std::fs::read_to_string(bench.path("uncut.csv"))
-        .unwrap()
-        .lines()
-        .take(200)
-        .fold(String::new(), |text, line| text + line + "\n");
-    std::fs::write(bench.path("hand.csv"), hand).unwrap();
     let refused = bench.run(&["identify", "hand.csv", "--find-free"]);
     assert!(refused.code == Some(1) && refused.says("not-free"), "{refused:?}");
 }

@@ -1,6 +1,6 @@
 //! The conclusions from a log about the body, and their limits, as sentences.
 
-use super::motion::{GROUPS, Motion};
+use super::motion::{GROUPS, Motion, Sums};
 use super::{AxesFit, TensorFit, nearest_body};
 use nalgebra::Vector3;
 
@@ -29,8 +29,9 @@ const WELL: f64 = 0.02;
 const ILL: f64 = 2e-4;
 /// The least ratio of the unexplained parts where the right scale is not that of a unit.
 const FAR: f64 = 10.0;
-/// The factor by which a scale differs from another.
+/// The factor by which a scale differs from another, and the part of the gain of the right one that it loses at least.
 const APART: f64 = 1.25;
+const ALIKE: f64 = 0.03;
 /// The parts of the mean square of the rates, about another axis than the first, up to which a body turns about one axis: in any log,
 /// and in one where it is below four times the noise.
 const ONE_AXIS: [f64; 2] = [1e-8, 1e-3];
@@ -337,20 +338,20 @@ pub fn findings(
 /// Returns the factor of all rates, or times, at which the motion is that of a free body, if it is not 1: that of a unit, or the one
 /// at which the coefficients' identity holds.
 pub fn wrong_scale(motion: &Motion) -> Option<f64> {
-    let scatter = motion.total().scatter.diagonal();
-    let noise = motion.noise().sum() * motion.total().samples as f64 / scatter.fixed_rows::<3>(0).sum();
     // Rates of 1/k have the coefficients k a, so that a1 + a2 + a3 + a1 a2 a3 / k² = 0 in place of the identity.
     let identity =
         motion.about_known_axes(true).map(|fit| libm::sqrt(-fit.coefficients.product() / fit.coefficients.sum()));
     let identity = identity.filter(|factor| factor.is_finite() && !(1.0 / APART..APART).contains(factor));
-    let better = |whole: bool| {
+    let better = |sums: &Sums, identity: Option<f64>, whole: bool| {
+        let noise = motion.noise().sum() * sums.samples as f64 / sums.scatter.diagonal().fixed_rows::<3>(0).sum();
         // Where no body fits at all, everything is unexplained.
-        let own = motion.unexplained(whole, 1.0).unwrap_or(1.0);
+        let own = sums.unexplained(whole, 1.0).unwrap_or(1.0);
         let least = |scales: &[f64]| {
-            let parts = scales.iter().filter_map(|factor| Some((motion.unexplained(whole, *factor)?, *factor)));
+            let parts = scales.iter().filter_map(|factor| Some((sums.unexplained(whole, *factor)?, *factor)));
             parts.min_by(|first, second| first.0.total_cmp(&second.0))
         };
-        let is_wrong = |least: f64| least < WELL && own > BETTER * least && own > 2.0 * noise;
+        let is_better = |least: f64| own - noise > BETTER * (least - noise).max(0.0) && own > 1.5 * noise;
+        let is_wrong = |least: f64| least < WELL && is_better(least);
         let unit = least(&SCALES).filter(|(least, _)| is_wrong(*least));
         let scale = identity
             .and_then(|factor| least(&[factor]))
@@ -362,15 +363,18 @@ pub fn wrong_scale(motion: &Motion) -> Option<f64> {
         };
         let (found, factor) = found?;
         // A body with two equal moments has no scale.
-        let alike = least(&[factor * APART, factor / APART]).is_some_and(|(next, _)| next < BETTER * found);
+        let next = least(&[factor * APART, factor / APART]);
+        let alike = next.is_some_and(|(next, _)| next < BETTER * found && next - found < ALIKE * (own - found));
         (!alike).then_some(factor)
     };
-    better(false).or_else(|| better(true))
+    // Whole segments rise above the noise where pieces, short in a wrong unit, do not.
+    let sums = [(motion.total(), identity), (Sums { wheel: motion.wheel, ..motion.whole }, None)];
+    sums.iter().find_map(|(sums, identity)| [false, true].into_iter().find_map(|whole| better(sums, *identity, whole)))
 }
 
 /// Returns true if the motion is that of a body in deg/s or ms too, as with two equal moments.
 pub fn has_no_scale(motion: &Motion) -> bool {
-    let part = |factor: f64| motion.unexplained(false, factor).unwrap_or(1.0);
+    let part = |factor: f64| motion.total().unexplained(false, factor).unwrap_or(1.0);
     let own = BETTER * part(1.0);
     [SCALES[0], SCALES[2]].into_iter().any(|factor| part(factor) < own)
 }

@@ -38,12 +38,12 @@ struct Window {
     weightless: bool,
 }
 
-/// Returns the stretches of free motion in segments of rising times, as pairs of times, s. `forces` has an accelerometer's values at
-/// the samples, gravity included, in any unit; NaN without one.
-pub fn free_stretches(segments: &[Vec<Sample>], forces: &[Vector3<f64>]) -> Vec<[f64; 2]> {
+/// Returns the stretches of free motion in segments of rising times, as pairs of times, s, and true if the accelerometer shows some.
+/// `forces` has its values at the samples, gravity included, in any unit; NaN without one.
+pub fn free_stretches(segments: &[Vec<Sample>], forces: &[Vector3<f64>]) -> (Vec<[f64; 2]>, bool) {
     let mut windows = Vec::new();
     let samples: Vec<Sample> = segments.iter().flatten().copied().collect();
-    let (Some(fast_rad_s), Some(interval_s)) = (fast(&samples), interval(segments)) else { return Vec::new() };
+    let (Some(fast_rad_s), Some(interval_s)) = (fast(&samples), interval(segments)) else { return (Vec::new(), false) };
     let length =
         ((WINDOW_TURN_RAD / (fast_rad_s * interval_s)) as usize).clamp(*WINDOW_SAMPLES.start(), *WINDOW_SAMPLES.end());
     let slow = samples.iter().zip(forces).filter(|(sample, _)| sample.rate_rad_s.norm() < SLOW * fast_rad_s);
@@ -70,7 +70,8 @@ pub fn free_stretches(segments: &[Vec<Sample>], forces: &[Vector3<f64>]) -> Vec<
     let bodies =
         || compared.iter().step_by(tried).filter_map(|window| solve(&window.sums, true, false)).filter(is_body);
     let most = || bodies().map(|body| (count(&body), body)).max_by_key(|(count, _)| *count).map(|(_, body)| body);
-    let mut body = if windows.iter().any(|window| window.weightless) { None } else { most() };
+    let weightless = windows.iter().any(|window| window.weightless);
+    let mut body = if weightless { None } else { most() };
     let free = |body: Option<&Solution>, window: &Window| {
         window.weightless || body.is_some_and(|body| is_free(body, &window.sums))
     };
@@ -95,7 +96,7 @@ pub fn free_stretches(segments: &[Vec<Sample>], forces: &[Vector3<f64>]) -> Vec<
     // Their ends reach into what the hand did.
     let trim = length / TRIM;
     let trimmed = stretches.into_iter().map(|[first, last]| [first + trim, last - trim]);
-    trimmed.map(|ends| ends.map(|index| samples[index].time_s)).collect()
+    (trimmed.map(|ends| ends.map(|index| samples[index].time_s)).collect(), weightless)
 }
 
 /// Returns the sums of a window.
@@ -192,7 +193,7 @@ mod tests {
     #[test]
     fn the_throws_between_hand_motions_are_found_and_nothing_else() {
         let (samples, cuts) = log(20);
-        let found = free_stretches(&[samples], &[]);
+        let (found, _) = free_stretches(&[samples], &[]);
         let overlap =
             |cut: &[f64; 2]| found.iter().map(|own| (own[1].min(cut[1]) - own[0].max(cut[0])).max(0.0)).sum::<f64>();
         let hits = cuts.iter().filter(|cut| overlap(cut) > 0.3).count();
@@ -215,11 +216,12 @@ mod tests {
                 _ => segments.push(vec![sample]),
             }
         }
-        let found: f64 = free_stretches(&segments, &[]).iter().map(|own| own[1] - own[0]).sum();
+        let found: f64 = free_stretches(&segments, &[]).0.iter().map(|own| own[1] - own[0]).sum();
         assert!(found < 0.5, "{found}");
         let rest = |tick| Sample { time_s: f64::from(tick), rate_rad_s: Vector3::zeros() };
-        assert!(free_stretches(&[(0..100).map(rest).collect()], &[]).is_empty());
-        assert!(free_stretches(&[], &[]).is_empty() && free_stretches(&[vec![rest(0)]], &[]).is_empty());
+        for segments in [vec![(0..100).map(rest).collect()], vec![vec![rest(0)]], vec![]] {
+            assert_eq!(free_stretches(&segments, &[]), (vec![], false));
+        }
     }
 
     #[test]
@@ -250,8 +252,8 @@ mod tests {
         }
         for unit in [1.0, 1.0 / 9.81] {
             let forces: Vec<Vector3<f64>> = forces.iter().map(|force| force * unit).collect();
-            let found = free_stretches(&[samples.clone()], &forces);
-            assert_eq!(found.len(), cuts.len(), "{found:?}");
+            let (found, shown) = free_stretches(&[samples.clone()], &forces);
+            assert!(shown && found.len() == cuts.len(), "{found:?}");
             for (found, cut) in found.iter().zip(&cuts) {
                 assert!((found[0] - cut[0]).abs() < 0.1 && (found[1] - cut[1]).abs() < 0.1, "{found:?} {cut:?}");
             }

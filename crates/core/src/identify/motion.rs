@@ -58,6 +58,19 @@ impl Default for Sums {
     }
 }
 
+impl Sums {
+    /// Adds a piece; returns false if it is too short.
+    fn add(&mut self, piece: &Piece) -> bool {
+        let is_long = piece.samples >= PIECE_SAMPLES;
+        if is_long {
+            self.scatter += piece.scatter;
+            self.samples += piece.samples;
+            self.pieces += 1;
+        }
+        is_long
+    }
+}
+
 /// The motion in a log, as sums of constant size.
 ///
 /// ```
@@ -82,6 +95,9 @@ pub struct Motion {
     pub(super) groups: [Sums; GROUPS],
     integral: Integral,
     piece: Piece,
+    /// The sums over whole segments: in a unit that is too small, pieces are too short to rise above noise.
+    pub(super) whole: Sums,
+    segment: Piece,
     summary: MotionSummary,
     /// The newest rate with its differences up to the third, and the number of samples since the segment began.
     differences: [Vector3<f64>; 4],
@@ -116,6 +132,8 @@ impl Default for Motion {
             groups: [Sums::default(); GROUPS],
             integral: Integral::default(),
             piece: Piece::default(),
+            whole: Sums::default(),
+            segment: Piece::default(),
             summary: MotionSummary::default(),
             differences: [Vector3::zeros(); 4],
             in_row: 0,
@@ -185,6 +203,7 @@ impl Motion {
             self.add(&features);
         }
         self.end_piece();
+        self.whole.add(&core::mem::take(&mut self.segment));
     }
 
     /// Returns the summary.
@@ -225,6 +244,7 @@ impl Motion {
 
     #[inline]
     fn add(&mut self, features: &SVector<f64, FEATURES>) {
+        self.segment.add(features);
         self.piece.add(features);
         if self.piece.turn_rad > PIECE_TURN_RAD {
             self.end_piece();
@@ -234,14 +254,8 @@ impl Motion {
     }
 
     fn end_piece(&mut self) {
-        let piece = core::mem::take(&mut self.piece);
-        if piece.samples >= PIECE_SAMPLES {
-            let group = &mut self.groups[(self.summary.pieces % GROUPS as u64) as usize];
-            group.scatter += piece.scatter;
-            group.samples += piece.samples;
-            group.pieces += 1;
-            self.summary.pieces += 1;
-        }
+        let group = &mut self.groups[(self.summary.pieces % GROUPS as u64) as usize];
+        self.summary.pieces += u64::from(group.add(&core::mem::take(&mut self.piece)));
     }
 }
 

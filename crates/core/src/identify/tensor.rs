@@ -84,22 +84,6 @@ impl Motion {
         self.tensor(false, damping)
     }
 
-    /// Fits a tensor, the whole one or about the sensor's axes, to the motion of rates times `scale`. Returns the unexplained part
-    /// of the variance of all rates; `None` if no body has the tensor.
-    #[cfg(feature = "std")]
-    pub(super) fn unexplained(&self, whole: bool, scale: f64) -> Option<f64> {
-        let mut total = self.total();
-        for product in PRODUCTS..TURNS {
-            total.scatter.row_mut(product).scale_mut(scale);
-            total.scatter.column_mut(product).scale_mut(scale);
-        }
-        let best = solve(&total, whole, true)?;
-        super::nearest_body(&principal(&best.tensor)?.0).ok()?;
-        let whole = total.scatter.diagonal().fixed_rows::<3>(0).into_owned();
-        let part = r_squared(&total, &best)?.map(|explained| 1.0 - explained);
-        Some(part.dot(&whole) / whole.sum())
-    }
-
     fn tensor(&self, whole: bool, damping: bool) -> Option<TensorFit> {
         let total = self.total();
         let best = solve(&total, whole, damping)?;
@@ -138,6 +122,23 @@ impl Motion {
             distinction: best.distinction,
             largest: self.has_wheel().then_some(largest),
         })
+    }
+}
+
+#[cfg(feature = "std")]
+impl Sums {
+    /// Fits a tensor, the whole one or about the sensor's axes, to the motion of rates times `scale`. Returns the unexplained part
+    /// of the variance of all rates; `None` if no body has the tensor.
+    pub fn unexplained(mut self, whole: bool, scale: f64) -> Option<f64> {
+        for product in PRODUCTS..TURNS {
+            self.scatter.row_mut(product).scale_mut(scale);
+            self.scatter.column_mut(product).scale_mut(scale);
+        }
+        let best = solve(&self, whole, true)?;
+        super::nearest_body(&principal(&best.tensor)?.0).ok()?;
+        let whole = self.scatter.diagonal().fixed_rows::<3>(0).into_owned();
+        let part = r_squared(&self, &best)?.map(|explained| 1.0 - explained);
+        Some(part.dot(&whole) / whole.sum())
     }
 }
 

@@ -174,13 +174,22 @@ fn rates_at_another_scale_are_found_by_the_identity() {
     for (moments, factor) in [([0.4, 0.8, 1.0], 0.5), ([0.4, 0.8, 1.0], 17.0), ([0.5, 0.7, 1.0], 0.2)] {
         for noise_rad_s in [0.0, 0.01] {
             let motion = scaled(moments, 1.0 / factor, noise_rad_s);
-            let parts = [1.0, factor].map(|factor| motion.unexplained(false, factor));
+            let parts = [1.0, factor].map(|factor| motion.total().unexplained(false, factor));
             let found = wrong_scale(&motion).unwrap_or(f64::NAN);
             assert!((found / factor - 1.0).abs() < 0.05, "{factor}: {found}, left {parts:?}");
         }
     }
     for moments in [[0.4, 0.8, 1.0], [0.93, 0.08, 1.0], [0.97, 0.98, 1.0], [0.5, 0.5, 1.0]] {
         assert_eq!(wrong_scale(&scaled(moments, 1.0, 0.01)), None, "{moments:?}");
+    }
+    // In deg/s, a piece is too short to rise above the noise.
+    for (turn, noise_rad_s) in [([0.0; 3], 2e-3), ([0.3, -0.2, 0.25], 2e-3), ([0.0; 3], 0.0)] {
+        let turn = Rotation3::from_euler_angles(turn[0], turn[1], turn[2]);
+        let slow = Tumble { moments: [0.4, 0.8, 1.0], interval_s: 0.1, speed_rad_s: 0.08, ..Tumble::default() };
+        let slow = Tumble { segments: 3, samples: 600, noise_rad_s, turn, ..slow };
+        let factor = core::f64::consts::PI / 180.0;
+        assert_eq!(wrong_scale(&slow.motion_at(1.0 / factor)), Some(factor), "{noise_rad_s}");
+        assert_eq!(wrong_scale(&slow.motion()), None, "{noise_rad_s}");
     }
     assert!(has_no_scale(&scaled([0.99, 0.99, 1.0], 1.0, 0.01)) && !has_no_scale(&scaled([0.4, 0.8, 1.0], 1.0, 0.01)));
 }

@@ -9,9 +9,9 @@ use std::path::Path;
 
 /// Names of a time stamp, without unit; the first list that has one decides.
 const STAMPS: [&str; 3] = [
-    "headerstamp sampletimefine",
+    "headerstamp sampletimefine timestampsample",
     "elapsed elapsedtime timeelapsed",
-    "time t timestamp stamp loggingtime systemtime unixtime devicetime sensortime datetime timeboot timestampsample rostime \
+    "time t timestamp stamp loggingtime systemtime unixtime devicetime sensortime datetime timeboot rostime \
      utc clock epoch simtime runtime reltime trel tow gpstow zeit temps tiempo tempo czas",
 ];
 /// Words that make a name with another of them a time stamp, and words that prevent it.
@@ -27,7 +27,7 @@ const RATE_PARTS: &str =
     "gyro angularvelocity angularrate angvel angularspeed rotationrate rotrate bodyrate angrate anglerate omega";
 /// Words of quantities that are related to an angular velocity.
 const NO_RATE_WORDS: &str = "bias offset cov covariance std stddev var variance accel acc acceleration linear mag temp temperature \
-                             setpoint desired des target cmd command ref error noise";
+                             setpoint desired des target cmd command ref error err noise wheel rw motor rotor";
 /// Words of quantities that are related to an acceleration.
 const NO_FORCE_WORDS: &str =
     "bias offset cov covariance std stddev var variance angular setpoint desired target cmd command error noise";
@@ -259,17 +259,21 @@ fn rate_name(name: &str, gyro: bool) -> Option<RateName> {
             || RATE_PARTS.split(' ').any(|part| stem.contains(part))
             || (part.len() > 2 && stem == "speed")
     })?;
-    words.retain(|word| word != "xyz");
+    words.retain(|word| word != "xyz" && word != "axis");
     let stem = words.concat();
     let part = RATE_PARTS.split(' ').any(|part| stem.contains(part));
     // An angle would have no time in its unit.
-    let per_second = ["/s", "ps", "s-1", "s^-1", "sec"].iter().any(|part| name.to_lowercase().contains(part));
+    let lower = name.to_lowercase();
+    let per_second = ["/s", "ps", "s-1", "s^-1", "sec"].iter().any(|part| lower.contains(part) && !stem.contains(part));
+    let is_rate = per_second && matches!(claim, Claim::Known(_)) && !turn;
     let rank = if listed(RATES, &stem) || (turn && stem == "speed") {
         0
     } else if part || words.iter().any(|word| listed(RATE_WORDS, word)) {
         1
-    } else if stem.is_empty() && !turn && (gyro || (per_second && matches!(claim, Claim::Known(_)))) {
+    } else if stem.is_empty() && !turn && (gyro || is_rate) {
         2
+    } else if is_rate {
+        4
     } else {
         return None;
     };
@@ -337,6 +341,7 @@ pub fn find(
         rates: (rates.map(name), given_rate.unwrap_or(RateUnit::RadiansPerSecond)),
         assumed,
         found: String::new(),
+        forces: forces.map(|columns| columns.map(|column| names[column].clone())),
     };
     Ok(Places { time, time_part, rates, forces, by, meaning })
 }
@@ -352,7 +357,7 @@ impl Search<'_> {
     fn unnamed(&self) -> &'static str {
         // In a file without header the names are numbers.
         let numbers = self.names.iter().all(|name| name.parse::<f64>().is_ok());
-        if self.options.header && numbers { "; if it has no header say so, and give columns by number" } else { "" }
+        if !self.options.unnamed && numbers { "; if it has no header say so, and give columns by number" } else { "" }
     }
 
     /// Returns the column with a name, in any case, or with a number from 1.
@@ -437,7 +442,7 @@ impl Search<'_> {
             rates = found;
         }
         for (axis, rate) in rates.iter().enumerate() {
-            if rate.is_none() && self.options.needed[axis] {
+            if rate.is_none() && !self.options.may_lack[axis] {
                 let letter = ["x", "y", "z"][axis];
                 let reason = format!("no column is known to be the rate about {letter}");
                 let remedy = "name the three columns of the rates, or their numbers (--rates)";
@@ -481,7 +486,7 @@ impl Search<'_> {
         }
         let complete = |columns: &[Option<usize>; 3]| columns.iter().all(Option::is_some);
         let enough =
-            |columns: &[Option<usize>; 3]| (0..3).all(|axis| columns[axis].is_some() || !self.options.needed[axis]);
+            |columns: &[Option<usize>; 3]| (0..3).all(|axis| columns[axis].is_some() || self.options.may_lack[axis]);
         for wanted in [&complete as &dyn Fn(&[Option<usize>; 3]) -> bool, &enough, &|_| true] {
             let fitting: Vec<_> = groups.iter().filter(|(_, columns)| wanted(columns)).collect();
             let best = fitting.iter().map(|(rank, _)| rank).min();
@@ -566,6 +571,8 @@ mod tests {
             (["Zeit (s)", "P (rad/s)", "Q (rad/s)", "R (rad/s)"], Seconds, RadiansPerSecond),
             (["time, ms", "ωₓ [deg/s]", "ωᵧ [deg/s]", "ωᶻ [deg/s]"], Milliseconds, DegreesPerSecond),
             (["t_rel (s)", "rotRateX_dps", "rotRateY_dps", "rotRateZ_dps"], Seconds, DegreesPerSecond),
+            (["t (s)", "Rot x (deg/s)", "Rot y (deg/s)", "Rot z (deg/s)"], Seconds, DegreesPerSecond),
+            (["elapsed (s)", "x-axis (deg/s)", "y-axis (deg/s)", "z-axis (deg/s)"], Seconds, DegreesPerSecond),
         ] {
             let places = found(&names, &Options::default()).unwrap();
             assert_eq!((places.time, places.rates), (Some(0), [Some(1), Some(2), Some(3)]), "{names:?}");
@@ -575,6 +582,8 @@ mod tests {
         let bare = found(&["wz", "t", "wx", "wy", "ax", "ay", "az"], &Options::default()).unwrap();
         assert_eq!((bare.time, bare.rates), (Some(1), [Some(2), Some(3), Some(0)]));
         assert_eq!(bare.meaning.assumed, ["time", "rate"]);
+        let autopilot = found(&["timestamp", "timestamp_sample", "gx", "gy", "gz"], &Options::default()).unwrap();
+        assert_eq!(autopilot.time, Some(1));
     }
 
     #[test]
@@ -626,6 +635,9 @@ mod tests {
         assert!(refused(&["t_s", "wx rad/s/s", "wy rad/s/s", "wz rad/s/s"], &none).contains("about x"));
         assert!(refused(&["t_s", "wx (rad/s/s)", "wy (rad/s/s)", "wz (rad/s/s)"], &none).contains("not a known unit"));
         assert!(refused(&["t_s", "q", "r"], &none).contains("about x"));
+        for names in [["wheel_wx", "omega_err_y", "rw_omega_z"], ["steps_x (deg)", "steps_y (deg)", "steps_z (deg)"]] {
+            assert!(refused(&[&["t_s"], &names[..]].concat(), &none).contains("about x"));
+        }
         let named = |time: &str, rates: [&str; 3]| Options {
             time: Some(time.to_owned()),
             rates: Some(rates.map(str::to_owned)),
@@ -634,7 +646,7 @@ mod tests {
         assert!(refused(&["a", "b", "c", "d"], &named("e", ["b", "c", "d"])).contains("no column `e`"));
         assert!(refused(&["a", "b", "c", "b"], &named("a", ["b", "c", "b"])).contains("2 columns are called `b`"));
         assert!(refused(&["a", "b", "c", "d"], &named("a", ["b", "c", "a"])).contains("`a` is named twice"));
-        let blind = Options { needed: [true, true, false], ..named("a", ["b", "c", "-"]) };
+        let blind = Options { may_lack: [false, false, true], ..named("a", ["b", "c", "-"]) };
         assert_eq!(found(&["a", "b", "c"], &blind).unwrap().rates, [Some(1), Some(2), None]);
     }
 }

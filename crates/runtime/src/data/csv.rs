@@ -25,26 +25,22 @@ const TOO_LONG: &str = "a line is longer than 1 MiB; name a CSV file";
 
 /// A reader of a text table.
 pub struct Csv {
-    lines: Lines,
-    cells: usize,
-    places: Places,
-    rows: i64,
-    ending: Ending,
-}
-
-/// The text from the first row on.
-type Rest = Spaces<Chain<Cursor<Vec<u8>>, LineEnds<Box<dyn Read>>>>;
-
-/// The records of a file.
-struct Lines {
     path: PathBuf,
     reader: Reader<Rest>,
     record: ByteRecord,
     /// The number of lines before the first row.
     before: u64,
+    separator: u8,
     /// True if numbers may have a decimal comma.
     comma: bool,
+    cells: usize,
+    places: Places,
+    rows: i64,
+    half: bool,
 }
+
+/// The text from the first row on.
+type Rest = Chain<Cursor<Vec<u8>>, LineEnds<Box<dyn Read>>>;
 
 impl Csv {
     /// Finds the table and its columns.
@@ -74,20 +70,28 @@ impl Csv {
         let skipped = options.skip + found.lines;
         let begin = place(skipped);
         let rest = Cursor::new(start.split_off(begin)).chain(source);
-        let rest = Spaces { source: rest, joins: found.separator == b' ', last: b'\n' };
         let mut builder = ReaderBuilder::new();
         builder.delimiter(found.separator).comment(Some(b'#')).trim(Trim::All).has_headers(false).flexible(true);
         // Beside a decimal point, a comma groups the digits of a number.
         let point = found.first.iter().any(|cell| cell.contains('.') && cell.parse::<f64>().is_ok());
         let comma = found.separator != b',' && !point;
-        let lines = Lines {
+        if comma && table::groups_digits(text.lines().skip(found.lines as usize), found.separator) {
+            let (path, line) = (path.to_owned(), skipped + 1);
+            let reason = "commas group the digits of its numbers; write them without".to_owned();
+            return Err(DataError::Form { path, line, reason });
+        }
+        let mut csv = Self {
             path: path.to_owned(),
             reader: builder.from_reader(rest),
             record: ByteRecord::new(),
             before: skipped,
+            separator: found.separator,
             comma,
+            cells,
+            places,
+            rows: 0,
+            half: false,
         };
-        let mut csv = Self { lines, cells, places, rows: 0, ending: Ending::default() };
         let text = &mut csv.places.meaning.found;
         match header {
             Some(line) => write!(text, "header at line {}", options.skip + line),
@@ -134,7 +138,7 @@ fn decoded(bytes: &[u8]) -> (String, &'static str) {
 fn places(found: &Table, path: &Path, options: &Options) -> Result<(Places, Option<u64>, usize), DataError> {
     let first = |column: usize| found.first.get(column).cloned().unwrap_or_default();
     let mut refusal = None;
-    if options.header {
+    if !options.unnamed {
         for (line, names) in &found.headers {
             match columns::find(names, path, options, first) {
                 Ok(places) => return Ok((places, Some(*line), names.len())),
@@ -159,9 +163,9 @@ fn read_error(path: &Path, line: u64, source: io::Error) -> DataError {
     }
 }
 
-impl Lines {
-    /// Reads the next record that is not a comment; returns false at the end.
-    fn read(&mut self) -> Result<bool, DataError> {
+impl Csv {
+    /// Reads the next record with cells that is not a comment; returns false at the end.
+    fn advance(&mut self) -> Result<bool, DataError> {
         loop {
             let read = self.reader.read_byte_record(&mut self.record).map_err(|error| {
                 let (path, line) = (&self.path, self.before + self.reader.position().line());
@@ -173,8 +177,12 @@ impl Lines {
                     }
                 }
             })?;
-            let comment = |mark: &&str| self.record.get(0).is_some_and(|cell| cell.starts_with(mark.as_bytes()));
-            if !read || !COMMENTS.iter().any(comment) {
+            if self.separator == b' ' {
+                let cells = self.record.iter().flat_map(|cell| cell.split(|byte| *byte == b'\t'));
+                self.record = cells.filter(|cell| !cell.is_empty()).collect();
+            }
+            let begins = |cell: &[u8]| COMMENTS.iter().any(|mark| cell.starts_with(mark.as_bytes()));
+            if !read || !self.record.get(0).is_none_or(begins) {
                 return Ok(read);
             }
         }
@@ -241,41 +249,38 @@ impl Lines {
     /// Returns true if no record follows, and the text ends without a line end.
     fn is_half_written(&mut self) -> bool {
         let read = self.reader.read_byte_record(&mut self.record);
-        read.is_ok_and(|read| !read) && self.reader.get_ref().source.get_ref().1.unterminated
+        read.is_ok_and(|read| !read) && self.reader.get_ref().get_ref().1.unterminated
     }
-}
 
-impl Csv {
-    /// Reads the current record into a row.
-    fn take(&mut self, row: &mut Row) -> Result<(), DataError> {
-        let Self { lines, cells, places, .. } = self;
-        let extra = lines.record.iter().skip(*cells).all(<[u8]>::is_empty);
-        if lines.record.len() < *cells || !extra {
-            let (path, found) = (lines.path.clone(), lines.record.len());
-            return Err(DataError::Cells { path, line: lines.line(), found, expected: *cells });
+    /// Converts the current record into a row.
+    fn take(&self, row: &mut Row) -> Result<(), DataError> {
+        let places = &self.places;
+        let extra = self.record.iter().skip(self.cells).all(<[u8]>::is_empty);
+        if self.record.len() < self.cells || !extra {
+            let (path, found) = (self.path.clone(), self.record.len());
+            return Err(DataError::Cells { path, line: self.line(), found, expected: self.cells });
         }
-        row.number = lines.line();
+        row.number = self.line();
         let (name, unit) = &places.meaning.time;
         row.stamp = match places.time {
-            Some(column) => lines.stamp(column, name, *unit)?,
+            Some(column) => self.stamp(column, name, *unit)?,
             None => Some(Stamp::whole(self.rows, *unit)),
         };
         if let (Some((column, unit)), Some(stamp)) = (places.time_part, row.stamp) {
-            row.stamp = lines.stamp(column, "", unit)?.map(|part| stamp.plus(&part));
+            row.stamp = self.stamp(column, "", unit)?.map(|part| stamp.plus(&part));
         }
         let (names, unit) = &places.meaning.rates;
         for (axis, rate) in row.rate_rad_s.iter_mut().enumerate() {
             *rate = match places.rates[axis].filter(|_| row.stamp.is_some()) {
-                Some(column) => lines.number(column, &names[axis])?.map_or(f64::NAN, |value| value * unit.rad_s()),
+                Some(column) => self.number(column, &names[axis])?.map_or(f64::NAN, |value| value * unit.rad_s()),
                 None => f64::NAN,
             };
         }
-        row.force = places
-            .forces
-            .map(|columns| columns.map(|column| lines.number(column, "").ok().flatten().unwrap_or(f64::NAN)));
+        let force = |column| self.number(column, "").ok().flatten().unwrap_or(f64::NAN);
+        row.force = places.forces.map(|columns| columns.map(force));
         row.key.clear();
         if let Some(column) = places.by {
-            row.key.extend_from_slice(lines.cell(column));
+            row.key.extend_from_slice(self.cell(column));
         }
         Ok(())
     }
@@ -283,21 +288,13 @@ impl Csv {
 
 impl Rows for Csv {
     fn read(&mut self, row: &mut Row) -> Result<bool, DataError> {
-        if !self.lines.read()? {
-            self.ending.zeros = self.lines.reader.get_ref().source.get_ref().1.zeros;
+        if !self.advance()? {
             return Ok(false);
         }
-        match self.take(row) {
-            Err(error) if !self.lines.is_half_written() => Err(error),
-            Err(_) => {
-                self.ending = Ending { half: true, zeros: self.lines.reader.get_ref().source.get_ref().1.zeros };
-                Ok(false)
-            }
-            Ok(()) => {
-                self.rows += 1;
-                Ok(true)
-            }
-        }
+        let taken = self.take(row);
+        self.rows += 1;
+        self.half = taken.is_err() && self.is_half_written();
+        if self.half { Ok(false) } else { taken.map(|()| true) }
     }
 
     fn meaning(&self) -> &Meaning {
@@ -305,37 +302,7 @@ impl Rows for Csv {
     }
 
     fn ending(&self) -> Ending {
-        self.ending
-    }
-}
-
-/// A reader that joins runs of spaces and tabs, if they separate the cells.
-struct Spaces<R> {
-    source: R,
-    joins: bool,
-    last: u8,
-}
-
-impl<R: Read> Read for Spaces<R> {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        loop {
-            let read = self.source.read(buffer)?;
-            if !self.joins || read == 0 {
-                return Ok(read);
-            }
-            let mut count = 0;
-            for index in 0..read {
-                let byte = if buffer[index] == b'\t' { b' ' } else { buffer[index] };
-                if byte != b' ' || !matches!(self.last, b' ' | b'\n') {
-                    buffer[count] = byte;
-                    count += 1;
-                }
-                self.last = byte;
-            }
-            if count > 0 {
-                return Ok(count);
-            }
-        }
+        Ending { half: self.half, zeros: self.reader.get_ref().get_ref().1.zeros }
     }
 }
 

@@ -47,19 +47,25 @@ pub fn read_parts(path: &Path) -> Result<Vec<[f64; 2]>, DataError> {
     if parts.is_empty() { Err(DataError::Empty { path: path.to_owned() }) } else { Ok(parts) }
 }
 
-/// Returns options with the times of the free motion, if that is to be found.
-pub fn resolved(path: &Path, options: &Options) -> Result<Options, DataError> {
-    let cut = if options.cut == Cut::Free { Cut::Between(find_free(path, options)?) } else { options.cut.clone() };
-    Ok(Options { cut, ..options.clone() })
+/// The columns of the accelerometer that shows free motion.
+type Forces = Option<[String; 3]>;
+
+/// Returns options with the times of the free motion, if that is to be found, and the columns that show it.
+pub fn resolved(path: &Path, options: &Options) -> Result<(Options, Forces), DataError> {
+    if options.cut != Cut::Free {
+        return Ok((options.clone(), None));
+    }
+    let (parts, forces) = find_free(path, options)?;
+    Ok((Options { cut: Cut::Between(parts), ..options.clone() }, forces))
 }
 
 /// Finds the stretches of free motion in a log, and returns their times.
-fn find_free(path: &Path, options: &Options) -> Result<Vec<[f64; 2]>, DataError> {
+fn find_free(path: &Path, options: &Options) -> Result<(Vec<[f64; 2]>, Forces), DataError> {
     if !path.is_file() {
         let reason = "the log is read twice to find the free motion, so it must be a file; name one".to_owned();
         return Err(DataError::Option { name: "find free", reason });
     }
-    let whole = Options { needed: [true; 3], cut: Cut::Free, ..options.clone() };
+    let whole = Options { may_lack: [false; 3], ..options.clone() };
     let (mut segments, mut forces): (Vec<Vec<Sample>>, Vec<Vector3<f64>>) = (Vec::new(), Vec::new());
     let mut log = Log::open_whole(path, &whole)?;
     while let Some(entry) = log.next().transpose()? {
@@ -74,8 +80,9 @@ fn find_free(path: &Path, options: &Options) -> Result<Vec<[f64; 2]>, DataError>
         let sample = Sample { time_s: entry.time_s, rate_rad_s: entry.rate_rad_s.into() };
         segments.last_mut().expect("the first row begins one").push(sample);
     }
-    let found = free_stretches(&segments, &forces);
-    if found.is_empty() { Err(DataError::NotFree { path: path.to_owned() }) } else { Ok(found) }
+    let (found, shown) = free_stretches(&segments, &forces);
+    let columns = log.meaning().forces.clone().filter(|_| shown);
+    if found.is_empty() { Err(DataError::NotFree { path: path.to_owned() }) } else { Ok((found, columns)) }
 }
 
 #[cfg(test)]

@@ -166,12 +166,13 @@ pub fn estimate_log(
     let hidden = request.axis.wrapping_sub(1);
     // The sensors that contribute to the two rates about the other principal axes.
     let needed = [0, 1, 2].map(|sensor| (0..3).any(|axis| axis != hidden && axes[(sensor, axis)].abs() > UNMIXED));
-    let options = Options { needed, ..options.clone() };
+    let options = Options { may_lack: needed.map(|needed| !needed), ..options.clone() };
     let absent = |sensor: &usize| options.rates.as_ref().is_some_and(|names| names[*sensor] == "-");
     if let Some(sensor) = (0..3).filter(|sensor| needed[*sensor]).find(absent).filter(|_| request.axes.is_some()) {
         return Err(EstimateError::Mixed { axis: ["x", "y", "z"][sensor] });
     }
-    let mut log = Log::open(path, &resolved(path, &options)?)?;
+    let (options, forces) = resolved(path, &options)?;
+    let mut log = Log::open(path, &options)?;
     let principal = |entry: &Entry| {
         let measured = Vector3::from(entry.rate_rad_s);
         if request.axes.is_none() {
@@ -199,12 +200,13 @@ pub fn estimate_log(
     })?;
     let (mut score, mut segments, mut name) = (Score::default(), Vec::new(), String::new());
     let (mut fastest_rad_s, mut begun, mut diverged, mut last_s) = (0.0_f64, false, 0, 0.0);
-    let mut take = |entry: &Entry, named: &str| -> Result<(), EstimateError> {
-        if entry.begins {
-            segments.extend(score.end_segment().map(|score| (name.clone(), score)));
+    // With the name of a segment that begins.
+    let mut take = |entry: &Entry, named: Option<String>| -> Result<(), EstimateError> {
+        if let Some(named) = named {
+            let ended = std::mem::replace(&mut name, named);
+            segments.extend(score.end_segment().map(|score| (ended, score)));
             reconstruction.end_segment();
             begun = false;
-            named.clone_into(&mut name);
         }
         let principal_rad_s = principal(entry);
         let mut reconstructed = reconstruction.push(&Sample { time_s: entry.time_s, rate_rad_s: principal_rad_s });
@@ -222,22 +224,15 @@ pub fn estimate_log(
         diverged += u64::from(begun && !near && !entry.begins);
         each(&Estimated { entry: *entry, principal_rad_s, estimate: reconstructed }, &name).map_err(EstimateError::Sink)
     };
-    let mut names = String::new();
-    for (entry, named) in &head {
-        if let Some(named) = named {
-            names.clone_from(named);
-        }
-        take(entry, &names)?;
+    for (entry, named) in head {
+        take(&entry, named)?;
     }
-    drop(head);
     while let Some(entry) = log.next().transpose()? {
-        if entry.begins {
-            names = log.segment_name();
-        }
-        take(&entry, &names)?;
+        take(&entry, entry.begins.then(|| log.segment_name()))?;
     }
     segments.extend(score.end_segment().map(|score| (name, score)));
-    let account = LogAccount { path: path.to_owned(), ..LogAccount::new(&log) };
+    let mut account = LogAccount { path: path.to_owned(), ..LogAccount::new(&log) };
+    account.meaning.forces = forces;
     Ok(Estimation {
         log: account,
         filter,
@@ -289,11 +284,7 @@ fn survey(
 /// Returns the requested filter; a missing rate or noise is that of the log's start.
 fn filter(request: &Request, choice: Option<&RateChoice>, path: &Path) -> Result<FilterKind, EstimateError> {
     let none = || EstimateError::NoRate { path: path.display().to_string() };
-    let decay_per_s = match (request.decay_per_s, choice) {
-        (Some(given), _) => given,
-        (None, Some(choice)) => choice.decay_per_s,
-        (None, None) => return Err(none()),
-    };
+    let decay_per_s = request.decay_per_s.or(choice.map(|choice| choice.decay_per_s)).ok_or_else(none)?;
     Ok(match request.order {
         FilterOrder::First => FilterKind::First { decay_per_s },
         FilterOrder::Second => FilterKind::Second { bandwidth_rad_s: decay_per_s },

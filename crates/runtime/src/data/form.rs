@@ -25,7 +25,7 @@ use std::path::PathBuf;
 /// # Ok(())
 /// # }
 /// ```
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Options {
     /// The topic of an MCAP file, or the end of its name. MCAP needs no column names or units.
     pub topic: Option<String>,
@@ -41,12 +41,12 @@ pub struct Options {
     pub by: Option<String>,
     /// A longer pause begins a new segment, s.
     pub gap_s: Option<f64>,
-    /// True if the columns have names; else they are called by number.
-    pub header: bool,
+    /// True if the columns have no names; they are called by number.
+    pub unnamed: bool,
     /// The number of lines before the table, apart from those that the reader leaves out by itself.
     pub skip: u64,
-    /// The rates that a row must have; other rows are left out.
-    pub needed: [bool; 3],
+    /// The rates that a row may lack; rows without another one are left out.
+    pub may_lack: [bool; 3],
     /// The parts of the log that are read.
     pub cut: Cut,
 }
@@ -61,24 +61,6 @@ pub enum Cut {
     Between(Vec<[f64; 2]>),
     /// The stretches in which one body moves freely: found by `identify_logs` and `estimate_log`.
     Free,
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Self {
-            topic: None,
-            time: None,
-            rates: None,
-            time_unit: None,
-            rate_unit: None,
-            by: None,
-            gap_s: None,
-            header: true,
-            skip: 0,
-            needed: [true; 3],
-            cut: Cut::Whole,
-        }
-    }
 }
 
 /// An error while reading a log.
@@ -129,9 +111,9 @@ pub enum DataError {
         /// The mistake, and the remedy.
         reason: String,
     },
-    /// A row has more or fewer cells than the first.
+    /// A row has more or fewer cells than the header, or the first row.
     #[error(
-        "{}:{line}: the row has {found} cells, the first one has {expected}; correct it, or if its numbers have a decimal comma \
+        "{}:{line}: the row has {found} cells in place of {expected}; correct it, or if its numbers have a decimal comma \
          write them with a point", path.display()
     )]
     #[strum(serialize = "row-length")]
@@ -142,7 +124,7 @@ pub enum DataError {
         line: u64,
         /// The number of cells in the row.
         found: usize,
-        /// The number of cells in the first row.
+        /// The number of cells in the header, or the first row.
         expected: usize,
     },
     /// The file does not have a known format.
@@ -223,6 +205,8 @@ pub struct Meaning {
     pub assumed: Vec<&'static str>,
     /// The form of the table, such as its separator.
     pub found: String,
+    /// The columns of an accelerometer that shows free motion, where that was found.
+    pub forces: Option<[String; 3]>,
 }
 
 impl Meaning {

@@ -74,26 +74,25 @@ pub struct Identified {
 /// # Errors
 /// [`DataError`].
 pub fn identify_logs(paths: &[PathBuf], options: &Options, ways: &Ways) -> Result<Identified, DataError> {
-    let all = Options { needed: [true; 3], ..options.clone() };
+    let all = Options { may_lack: [false; 3], ..options.clone() };
     let rereadable = paths.iter().all(|path| path.is_file());
     let mut motion = Motion::with_wheel(ways.wheel);
     let mut recursive = Filters::new(ways, 0.0)?;
     let mut logs = Vec::new();
     // The free motion of each log is found once.
     let found = paths.iter().map(|path| resolved(path, &all)).collect::<Result<Vec<_>, _>>()?;
-    for (path, all) in paths.iter().zip(&found) {
-        logs.push(read(path, all, |step| match step {
-            Step::Sample(sample) => {
-                motion.push(sample);
-                if !rereadable {
-                    recursive.push(sample);
-                }
+    for (path, (all, forces)) in paths.iter().zip(&found) {
+        let mut log = read(path, all, |sample| {
+            match sample {
+                Some(sample) => motion.push(sample),
+                None => motion.end_segment(),
             }
-            Step::End => {
-                motion.end_segment();
-                recursive.end_segment();
+            if !rereadable {
+                recursive.take(sample);
             }
-        })?);
+        })?;
+        log.meaning.forces.clone_from(forces);
+        logs.push(log);
     }
     let (axes, body) = (motion.about_known_axes(ways.damping), motion.moments_about_known_axes(ways.damping));
     let tensor = motion.about_unknown_axes(ways.damping);
@@ -106,11 +105,8 @@ pub fn identify_logs(paths: &[PathBuf], options: &Options, ways: &Ways) -> Resul
     if rereadable && !motion.has_wheel() {
         recursive_damping_per_s = body.map_or(0.0, |fit| fit.damping_per_s);
         recursive = Filters::new(ways, recursive_damping_per_s)?;
-        for (path, all) in paths.iter().zip(&found) {
-            read(path, all, |step| match step {
-                Step::Sample(sample) => recursive.push(sample),
-                Step::End => recursive.end_segment(),
-            })?;
+        for (path, (all, _)) in paths.iter().zip(&found) {
+            read(path, all, |sample| recursive.take(sample))?;
         }
     }
     Ok(Identified {
@@ -138,34 +134,27 @@ impl Filters {
             let reason = format!("a decay rate of {decay} is out of range; give a number above 0");
             return Err(DataError::Option { name: "decay", reason });
         }
-        let symmetric =
-            ways.symmetry_axis.map(|axis| RecursiveAxisymmetricIdentifier::new(axis, ways.decay, damping_per_s));
-        let symmetric = symmetric.transpose();
+        let new = |axis| RecursiveAxisymmetricIdentifier::new(axis, ways.decay, damping_per_s);
+        let symmetric = ways.symmetry_axis.map(new).transpose();
         let symmetric =
             symmetric.map_err(|error| DataError::Option { name: "symmetry axis", reason: error.to_string() })?;
         Ok(Self { all: RecursiveIdentifier::new(ways.decay, damping_per_s), symmetric })
     }
 
-    fn push(&mut self, sample: &Sample) {
-        self.all.push(sample);
-        if let Some(filter) = &mut self.symmetric {
-            filter.push(sample);
+    /// Adds a sample; `None` ends a segment.
+    fn take(&mut self, sample: Option<&Sample>) {
+        let Self { all, symmetric } = self;
+        match sample {
+            Some(sample) => {
+                all.push(sample);
+                symmetric.iter_mut().for_each(|filter| filter.push(sample));
+            }
+            None => {
+                all.end_segment();
+                symmetric.iter_mut().for_each(RecursiveAxisymmetricIdentifier::end_segment);
+            }
         }
     }
-
-    fn end_segment(&mut self) {
-        self.all.end_segment();
-        if let Some(filter) = &mut self.symmetric {
-            filter.end_segment();
-        }
-    }
-}
-
-/// An event along a log.
-enum Step<'a> {
-    Sample(&'a Sample),
-    /// A segment ends.
-    End,
 }
 
 /// Returns a row as a sample.
@@ -173,14 +162,15 @@ pub(super) fn sample(entry: &Entry) -> Sample {
     Sample { time_s: entry.time_s, rate_rad_s: entry.rate_rad_s.into() }
 }
 
-fn read(path: &Path, options: &Options, mut each: impl FnMut(Step<'_>)) -> Result<LogAccount, DataError> {
+/// Reads a log; `None` ends a segment.
+fn read(path: &Path, options: &Options, mut each: impl FnMut(Option<&Sample>)) -> Result<LogAccount, DataError> {
     let mut log = Log::open(path, options)?;
     while let Some(entry) = log.next().transpose()? {
         if entry.begins {
-            each(Step::End);
+            each(None);
         }
-        each(Step::Sample(&sample(&entry)));
+        each(Some(&sample(&entry)));
     }
-    each(Step::End);
+    each(None);
     Ok(LogAccount::new(&log))
 }

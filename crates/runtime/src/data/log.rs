@@ -69,7 +69,7 @@ pub struct Counts {
 pub struct Log {
     path: PathBuf,
     rows: Box<dyn Rows>,
-    needed: [bool; 3],
+    may_lack: [bool; 3],
     gap_s: f64,
     plausible: Plausible,
     /// The parts that are read, and that of the last used row.
@@ -177,7 +177,7 @@ impl Log {
         Ok(Self {
             path: path.to_owned(),
             rows,
-            needed: options.needed,
+            may_lack: options.may_lack,
             gap_s,
             first: head.iter().find_map(|row| row.stamp),
             plausible,
@@ -259,8 +259,8 @@ impl Log {
 
     /// Counts the current row and returns its entry; `None` if it is left out.
     fn take(&mut self) -> Option<Entry> {
-        let known = |(needed, rate): (&bool, &f64)| !needed || rate.is_finite();
-        let complete = self.needed.iter().zip(&self.row.rate_rad_s).all(known);
+        let known = |(may_lack, rate): (&bool, &f64)| *may_lack || rate.is_finite();
+        let complete = self.may_lack.iter().zip(&self.row.rate_rad_s).all(known);
         let (Some(stamp), true) = (self.row.stamp, complete) else {
             self.counts.incomplete += 1;
             return None;

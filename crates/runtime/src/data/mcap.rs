@@ -2,12 +2,11 @@
 //!
 //! It reads from beginning to end, one record at a time. Must not trust a length in a message beyond the message's bytes.
 
-use super::form::{DataError, Meaning, Options, Row, Rows};
+use super::form::{Cut, DataError, Meaning, Options, Row, Rows};
 use super::packed::Zstd;
 use super::stamp::Stamp;
 use super::unit::{RateUnit, TimeUnit};
-use crate::sample::Layout;
-use crate::sample::{FieldKind, NO_SAMPLE};
+use crate::sample::{FieldKind, Layout, NO_SAMPLE};
 use mcap::McapError;
 use mcap::records::Record;
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
@@ -50,8 +49,16 @@ struct Content {
 enum Form {
     /// `sensor_msgs/msg/Imu`
     Imu,
-    /// A recorded sample; each field's offset from the start of the body, bytes.
-    Own { omega: usize, valid: Option<usize>, generation: Option<usize> },
+    /// A recorded sample.
+    Own(Offsets),
+}
+
+/// The fields of a recorded sample: offsets from the start of the body, bytes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Offsets {
+    omega: usize,
+    valid: Option<usize>,
+    generation: Option<usize>,
 }
 
 impl Mcap {
@@ -70,7 +77,7 @@ impl Mcap {
             ("rates", options.rates.is_some()),
             ("time unit", options.time_unit.is_some()),
             ("by", options.by.is_some()),
-            ("header", !options.header),
+            ("header", options.unnamed),
             ("skip", options.skip > 0),
         ] {
             if given {
@@ -91,6 +98,8 @@ impl Mcap {
             // The message's definition says rad/s, but some drivers write deg/s.
             assumed: if options.rate_unit.is_none() { vec!["rate"] } else { Vec::new() },
             found: String::new(),
+            forces: (options.cut == Cut::Free)
+                .then(|| ["x", "y", "z"].map(|axis| format!("linear_acceleration.{axis}"))),
         };
         let content = Content {
             topic: options.topic.clone(),
@@ -115,24 +124,18 @@ impl Rows for Mcap {
                 None => break,
                 Some(Ok(LinearReadEvent::ReadRequest(wanted))) => {
                     let room = self.reader.insert(wanted.max(READ_BYTES));
-                    match self.file.read(room) {
-                        Ok(count) => {
-                            self.reader.notify_read(count);
-                            Ok(false)
-                        }
-                        Err(source) => return Err(DataError::Read { path: self.path.clone(), source }),
-                    }
+                    let failed = |source| DataError::Read { path: self.path.clone(), source };
+                    let count = self.file.read(room).map_err(failed)?;
+                    self.reader.notify_read(count);
+                    Ok(false)
                 }
-                Some(Ok(LinearReadEvent::Record { data, opcode })) => match mcap::parse_record(opcode, data) {
-                    Ok(record) => self.content.take(&record, row),
-                    Err(error) => Err(words(&error)),
-                },
+                Some(Ok(LinearReadEvent::Record { data, opcode })) => mcap::parse_record(opcode, data)
+                    .map_err(|error| words(&error))
+                    .and_then(|record| self.content.take(&record, row)),
                 Some(Err(error)) => Err(words(&error)),
             };
-            match taken {
-                Ok(true) => return Ok(true),
-                Ok(false) => {}
-                Err(reason) => return Err(self.form(reason)),
+            if taken.map_err(|reason| self.form(reason))? {
+                return Ok(true);
             }
         }
         if !self.content.chosen.is_empty() {
@@ -192,19 +195,18 @@ impl Content {
                     return Ok(false);
                 }
                 match self.chosen.first() {
-                    None => {}
-                    // Another publisher of the topic.
-                    Some((_, first)) if known && *first == form => {}
-                    Some(_) if known => {
-                        return Err(format!("{} has messages of two types; record it again", channel.topic));
-                    }
-                    Some(_) => {
+                    Some(_) if !known => {
                         return Err(format!("more than one topic may be meant: {}; name one", self.topics.join(", ")));
                     }
+                    Some((_, first)) if *first != form => {
+                        return Err(format!("{} has messages of two types; record it again", channel.topic));
+                    }
+                    // The first one, or another publisher of the topic.
+                    _ => {}
                 }
                 self.chosen.push((channel.id, form));
                 self.meaning.found = format!("topic {}", channel.topic);
-                if matches!(form, Form::Own { .. }) {
+                if matches!(form, Form::Own(_)) {
                     if self.meaning.rates.1 != RateUnit::RadiansPerSecond {
                         return Err(
                             "a recording of this program is in rad/s; leave the unit of the rates out".to_owned()
@@ -221,7 +223,7 @@ impl Content {
                 self.messages += 1;
                 let decoded = match form {
                     Form::Imu => imu(data),
-                    Form::Own { omega, valid, generation } => own(data, header.publish_time, omega, valid, generation),
+                    Form::Own(offsets) => own(data, header.publish_time, &offsets),
                 };
                 let (stamp, rates, force) = decoded.ok_or("the message is shorter than its type; log again")?;
                 let rad_s = self.meaning.rates.1.rad_s();
@@ -247,7 +249,7 @@ fn form(name: &str, data: &[u8]) -> Option<Form> {
         (found.kind == kind && found.count == count).then_some(found.offset)
     };
     let (valid, generation) = (field("valid", FieldKind::U64, 1), field("generation", FieldKind::U64, 1));
-    Some(Form::Own { omega: field(OMEGA, FieldKind::F64, 3)?, valid, generation })
+    Some(Form::Own(Offsets { omega: field(OMEGA, FieldKind::F64, 3)?, valid, generation }))
 }
 
 /// A stamp, three rates, and the values of an accelerometer.
@@ -281,20 +283,14 @@ fn imu(message: &[u8]) -> Option<Decoded> {
 }
 
 /// Reads a recorded sample. A no-sample marker has no stamp; an invalid component has no value.
-fn own(
-    message: &[u8],
-    publish_time: u64,
-    omega: usize,
-    valid: Option<usize>,
-    generation: Option<usize>,
-) -> Option<Decoded> {
+fn own(message: &[u8], publish_time: u64, offsets: &Offsets) -> Option<Decoded> {
     let body = message.get(CDR_HEADER..)?;
     let word = |at: usize| Some(u64::from_le_bytes(body.get(at..at.checked_add(8)?)?.try_into().ok()?));
-    let valid = valid.map_or(Some(u64::MAX), word)?;
-    let no_sample = generation.map_or(Some(0), word)? & NO_SAMPLE != 0;
+    let valid = offsets.valid.map_or(Some(u64::MAX), word)?;
+    let no_sample = offsets.generation.map_or(Some(0), word)? & NO_SAMPLE != 0;
     let mut rates = [f64::NAN; 3];
     for (axis, rate) in rates.iter_mut().enumerate() {
-        let value = f64::from_bits(word(omega.checked_add(8 * axis)?)?);
+        let value = f64::from_bits(word(offsets.omega.checked_add(8 * axis)?)?);
         if valid & (1 << axis) != 0 {
             *rate = finite(value);
         }
@@ -384,7 +380,7 @@ mod tests {
             Options { rates: Some(["a", "b", "c"].map(str::to_owned)), ..degrees.clone() },
             Options { time_unit: Some(TimeUnit::Seconds), ..degrees.clone() },
             Options { by: named(), ..degrees.clone() },
-            Options { header: false, ..degrees.clone() },
+            Options { unnamed: true, ..degrees.clone() },
             Options { skip: 1, ..degrees.clone() },
         ] {
             assert!(matches!(Log::open(&path, &options).err(), Some(DataError::Option { .. })), "{options:?}");

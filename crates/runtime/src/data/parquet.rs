@@ -13,6 +13,8 @@ use std::path::{Path, PathBuf};
 
 /// The number of rows read at once.
 const BATCH_ROWS: usize = 8192;
+/// The longest part of a text shown in a message, bytes.
+const SHOWN_BYTES: usize = 40;
 
 /// A reader of a Parquet file.
 pub struct ParquetLog {
@@ -59,7 +61,8 @@ impl ParquetLog {
         let reader = SerializedFileReader::new(file).map_err(|error| form(&error))?;
         let schema = reader.metadata().file_metadata().schema_descr();
         let names: Vec<String> = schema.columns().iter().map(|column| column.path().string()).collect();
-        let mut places = columns::find(&names, path, &Options { header: true, ..options.clone() }, |_| String::new())?;
+        let mut places =
+            columns::find(&names, path, &Options { unnamed: false, ..options.clone() }, |_| String::new())?;
         let time = places.time.map(|column| schema.column(column));
         let kind = time.as_ref().and_then(|time| time.logical_type_ref());
         if let (None, Some(LogicalType::Timestamp(about))) = (options.time_unit, kind) {
@@ -99,53 +102,75 @@ impl ParquetLog {
         let wanted = [places.time].into_iter().chain(places.rates).chain([places.by, part]);
         let wanted = wanted.chain(places.forces.into_iter().flatten().map(Some));
         let schema = self.reader.metadata().file_metadata().schema_descr();
-        let mut columns = Vec::new();
-        for index in wanted {
-            let Some(index) = index else {
-                columns.push(None);
-                continue;
-            };
+        let open = |index: usize| {
             let about = schema.column(index);
             let name = about.path().string();
             if about.max_rep_level() > 0 {
                 return Err(ParquetError::General(format!("column {name} has lists; give plain numbers")));
             }
             let reader = group.get_column_reader(index)?;
-            columns.push(Some(Column { name, reader, defined: about.max_def_level(), cells: Vec::new() }));
-        }
+            Ok(Column { name, reader, defined: about.max_def_level(), cells: Vec::new() })
+        };
+        let columns = wanted.map(|index| index.map(open).transpose()).collect::<Result<_, _>>()?;
         self.columns = columns;
         self.group += 1;
         Ok(())
     }
 
     fn cell_error(&self, column: usize, reason: &str) -> DataError {
-        let found = self.columns[column].as_ref();
-        let text = match found.map(|column| &column.cells[self.given]) {
-            Some(Cell::Text(text)) => String::from_utf8_lossy(&text[..text.len().min(40)]).into_owned(),
-            Some(Cell::Float(value)) => value.to_string(),
-            Some(Cell::Whole(value)) => value.to_string(),
-            Some(Cell::None) | None => String::new(),
-        };
-        let name = found.map_or(String::new(), |column| column.name.clone());
-        let (path, reason) = (self.path.clone(), reason.to_owned());
-        DataError::Cell { path, line: self.rows, column: name, text, reason }
+        let text = self.cell(column).text();
+        let text = String::from_utf8_lossy(&text[..text.len().min(SHOWN_BYTES)]).into_owned();
+        let name = self.columns[column].as_ref().map_or(String::new(), |column| column.name.clone());
+        DataError::Cell { path: self.path.clone(), line: self.rows, column: name, text, reason: reason.to_owned() }
     }
 
     /// Returns a time stamp.
     fn stamp(&self, column: usize, unit: TimeUnit) -> Result<Option<Stamp>, DataError> {
+        let stamp = match self.cell(column) {
+            Cell::None => return Ok(None),
+            Cell::Float(value) if value.is_nan() => return Ok(None),
+            Cell::Whole(value) if value.unsigned_abs() < 1 << 62 => Some(Stamp::whole(*value, unit)),
+            Cell::Float(value) => Stamp::float(*value, unit),
+            Cell::Whole(_) => None,
+            Cell::Text(_) => return Err(self.cell_error(column, "is a text; give numbers")),
+        };
         let late = || self.cell_error(column, "is out of the range of time stamps; correct it");
+        stamp.map(Some).ok_or_else(late)
+    }
+
+    /// Returns a rate in its unit; NaN if it is unknown.
+    fn rate(&self, column: usize) -> Result<f64, DataError> {
         match self.cell(column) {
-            Cell::None => Ok(None),
-            Cell::Whole(value) if value.unsigned_abs() < 1 << 62 => Ok(Some(Stamp::whole(*value, unit))),
-            Cell::Float(value) if value.is_nan() => Ok(None),
-            Cell::Float(value) => Stamp::float(*value, unit).map(Some).ok_or_else(late),
-            Cell::Whole(_) => Err(late()),
             Cell::Text(_) => Err(self.cell_error(column, "is a text; give numbers")),
+            Cell::Float(value) if value.is_infinite() => {
+                Err(self.cell_error(column, "is not finite; leave unknown values empty"))
+            }
+            cell => Ok(cell.number()),
         }
     }
 
     fn cell(&self, column: usize) -> &Cell {
         self.columns.get(column).and_then(Option::as_ref).map_or(&Cell::None, |column| &column.cells[self.given])
+    }
+}
+
+impl Cell {
+    /// Returns the number; NaN without one.
+    fn number(&self) -> f64 {
+        match self {
+            Self::Whole(value) => *value as f64,
+            Self::Float(value) => *value,
+            Self::None | Self::Text(_) => f64::NAN,
+        }
+    }
+
+    fn text(&self) -> Vec<u8> {
+        match self {
+            Self::None => Vec::new(),
+            Self::Whole(value) => value.to_string().into_bytes(),
+            Self::Float(value) => value.to_string().into_bytes(),
+            Self::Text(text) => text.clone(),
+        }
     }
 }
 
@@ -210,31 +235,11 @@ impl Rows for ParquetLog {
             row.stamp = self.stamp(5, unit)?.map(|part| stamp.plus(&part));
         }
         let rad_s = self.places.meaning.rates.1.rad_s();
-        for axis in 0..3 {
-            row.rate_rad_s[axis] = match self.cell(1 + axis) {
-                Cell::None => f64::NAN,
-                Cell::Whole(value) => *value as f64 * rad_s,
-                Cell::Float(value) if value.is_infinite() => {
-                    return Err(self.cell_error(1 + axis, "is not finite; leave unknown values empty"));
-                }
-                Cell::Float(value) => *value * rad_s,
-                Cell::Text(_) => return Err(self.cell_error(1 + axis, "is a text; give numbers")),
-            };
+        for (axis, rate) in row.rate_rad_s.iter_mut().enumerate() {
+            *rate = self.rate(1 + axis)? * rad_s;
         }
-        row.force = self.places.forces.map(|_| {
-            [6, 7, 8].map(|column| match self.cell(column) {
-                Cell::Whole(value) => *value as f64,
-                Cell::Float(value) => *value,
-                Cell::None | Cell::Text(_) => f64::NAN,
-            })
-        });
-        row.key.clear();
-        match self.cell(4) {
-            Cell::None => {}
-            Cell::Whole(value) => row.key.extend_from_slice(value.to_string().as_bytes()),
-            Cell::Float(value) => row.key.extend_from_slice(value.to_string().as_bytes()),
-            Cell::Text(text) => row.key.extend_from_slice(text),
-        }
+        row.force = self.places.forces.map(|_| [6, 7, 8].map(|column| self.cell(column).number()));
+        row.key = self.cell(4).text();
         self.given += 1;
         Ok(true)
     }
@@ -265,26 +270,25 @@ mod tests {
         for group in 0..2_i64 {
             let rows = || group * 10_000..(group + 1) * 10_000;
             let mut into = writer.next_row_group().unwrap();
-            let mut column = into.next_column().unwrap().unwrap();
-            let keys: Vec<ByteArray> = rows().map(|row| format!("t{}", row / 5_000).into_bytes().into()).collect();
-            column.typed::<ByteArrayType>().write_batch(&keys, Some(&vec![1; keys.len()]), None).unwrap();
-            column.close().unwrap();
-            let mut column = into.next_column().unwrap().unwrap();
-            let stamps: Vec<i64> = rows().map(|row| 1_763_800_000_000_000 + 10_000 * row).collect();
-            column.typed::<Int64Type>().write_batch(&stamps, None, None).unwrap();
-            column.close().unwrap();
-            let mut column = into.next_column().unwrap().unwrap();
-            let values: Vec<f64> = rows().map(|row| row as f64).collect();
-            column.typed::<DoubleType>().write_batch(&values, None, None).unwrap();
-            column.close().unwrap();
-            let mut column = into.next_column().unwrap().unwrap();
-            let levels: Vec<i16> = rows().map(|row| i16::from(row % 10 != 0)).collect();
-            let values: Vec<f32> = rows().filter(|row| row % 10 != 0).map(|row| row as f32).collect();
-            column.typed::<FloatType>().write_batch(&values, Some(&levels), None).unwrap();
-            column.close().unwrap();
-            let mut column = into.next_column().unwrap().unwrap();
-            column.typed::<Int64Type>().write_batch(&rows().collect::<Vec<_>>(), None, None).unwrap();
-            column.close().unwrap();
+            macro_rules! column {
+                ($kind:ty, $values:expr, $levels:expr) => {{
+                    let (values, levels): (Vec<_>, Option<Vec<i16>>) = ($values.collect(), $levels);
+                    let mut column = into.next_column().unwrap().unwrap();
+                    column.typed::<$kind>().write_batch(&values, levels.as_deref(), None).unwrap();
+                    column.close().unwrap();
+                }};
+            }
+            let is_given = |row: &i64| row % 10 != 0;
+            column!(
+                ByteArrayType,
+                rows().map(|row| ByteArray::from(format!("t{}", row / 5_000).into_bytes())),
+                Some(vec![1; 10_000])
+            );
+            column!(Int64Type, rows().map(|row| 1_763_800_000_000_000 + 10_000 * row), None);
+            column!(DoubleType, rows().map(|row| row as f64), None);
+            let levels = rows().map(|row| i16::from(is_given(&row))).collect();
+            column!(FloatType, rows().filter(is_given).map(|row| row as f32), Some(levels));
+            column!(Int64Type, rows(), None);
             into.close().unwrap();
         }
         writer.close().unwrap();

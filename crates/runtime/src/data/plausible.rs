@@ -35,15 +35,16 @@ impl Plausible {
         if let Some(usual_s) = usual_s.filter(|usual_s| assumed("time") && !INTERVALS_S.contains(usual_s)) {
             let reason = format!("the usual interval would be {usual_s:.3e} s");
             let fastest_rad_s = head.iter().map(|row| speed_rad_s(row.rate_rad_s)).reduce(f64::max);
-            let fastest_rad_s = fastest_rad_s.filter(|rate_rad_s| *rate_rad_s < FASTEST_RAD_S);
+            // Beyond it, the rates are likely in deg/s.
+            let in_rad = |rate: f64| if rate < FASTEST_RAD_S { rate } else { rate.to_radians() };
+            let fastest_rad_s = fastest_rad_s.map(in_rad).filter(|rate_rad_s| *rate_rad_s < FASTEST_RAD_S);
             return Err(refuse(path, meaning, reason, likely(meaning, Some(usual_s), fastest_rad_s)));
         }
         let first = head.iter().find_map(|row| row.stamp).filter(|_| meaning.time.1 == TimeUnit::Seconds);
         if let Some((units, unit)) =
             first.filter(|_| assumed("time")).and_then(|first| Some((first.units(), since_1970(first.units())?)))
         {
-            let likely = format!("the stamps are likely in {unit}: give --time-unit {unit}");
-            return Err(refuse(path, meaning, format!("the first stamp would be {units} s"), likely));
+            return Err(refuse(path, meaning, format!("the first stamp would be {units} s"), vec![stamps_in(&unit)]));
         }
         let by_turn = usual_s.filter(|_| !meaning.assumed.is_empty()).map_or(f64::INFINITY, |usual_s| PI / usual_s);
         let by_rate = if assumed("rate") { FASTEST_RAD_S } else { f64::INFINITY };
@@ -105,26 +106,36 @@ fn scaled(path: &Path, meaning: &Meaning, factor: f64) -> DataError {
     let mut found = Vec::new();
     let assumed = |what| meaning.assumed.contains(&what);
     if let Some(unit) = TimeUnit::NUMBERS.iter().find(|unit| assumed("time") && same(1.0 / unit.per_second())) {
-        found.push(format!("the stamps are likely in {unit}: give --time-unit {unit}"));
+        found.push(stamps_in(unit));
     }
     if let Some(unit) = RateUnit::NUMBERS.iter().find(|unit| assumed("rate") && same(unit.rad_s())) {
-        found.push(format!("the rates are likely in {unit}: give --rate-unit {unit}"));
-    }
-    if found.is_empty() {
-        found.push("give the units with --time-unit and --rate-unit, or with --rate-scale".to_owned());
+        found.push(rates_in(unit));
     }
     let reason = format!("Euler's equations hold only for rates, or times, that are {factor:.3e} times as large");
-    refuse(path, meaning, reason, found.join("; or "))
+    refuse(path, meaning, reason, found)
 }
 
-/// Returns the error for assumed units.
-fn refuse(path: &Path, meaning: &Meaning, reason: String, likely: String) -> DataError {
+fn stamps_in(unit: &TimeUnit) -> String {
+    format!("the stamps are likely in {unit}: give --time-unit {unit}")
+}
+
+fn rates_in(unit: &RateUnit) -> String {
+    format!("the rates are likely in {unit}: give --rate-unit {unit}")
+}
+
+/// Returns the error for assumed units; `likely` are other ones.
+fn refuse(path: &Path, meaning: &Meaning, reason: String, likely: Vec<String>) -> DataError {
     let assumed = meaning.assumed_text().unwrap_or_default();
+    let likely = match likely.is_empty() {
+        true => "give the units with --time-unit and --rate-unit, or the rate of a counter with --rate-hz and the size of a \
+                 sensor's counts with --rate-scale".to_owned(),
+        false => likely.join("; or "),
+    };
     DataError::Unit { path: path.to_owned(), reason, assumed, likely }
 }
 
 /// Returns the units that make interval and rate likely, with their options. One unit is replaced at a time.
-fn likely(meaning: &Meaning, usual_s: Option<f64>, rate_rad_s: Option<f64>) -> String {
+fn likely(meaning: &Meaning, usual_s: Option<f64>, rate_rad_s: Option<f64>) -> Vec<String> {
     let fits = |time: f64, rate: f64| {
         let (usual_s, rate_rad_s) = (usual_s.map(|usual_s| usual_s * time), rate_rad_s.map(|own| own * rate));
         let turn_rad = usual_s.unwrap_or(0.0) * rate_rad_s.unwrap_or(0.0);
@@ -136,7 +147,7 @@ fn likely(meaning: &Meaning, usual_s: Option<f64>, rate_rad_s: Option<f64>) -> S
     if meaning.assumed.contains(&"time") {
         let own = meaning.time.1.per_second();
         let unit = TimeUnit::NUMBERS[1..].iter().find(|unit| fits(own / unit.per_second(), 1.0));
-        found.extend(unit.map(|unit| format!("the stamps are likely in {unit}: give --time-unit {unit}")));
+        found.extend(unit.map(stamps_in));
     }
     if meaning.assumed.contains(&"rate") {
         let own = meaning.rates.1.rad_s();
@@ -144,15 +155,9 @@ fn likely(meaning: &Meaning, usual_s: Option<f64>, rate_rad_s: Option<f64>) -> S
         let units = if found.is_empty() { &RateUnit::NUMBERS[1..] } else { &RateUnit::NUMBERS[1..2] };
         let unit = units.iter().find(|unit| fits(1.0, unit.rad_s() / own));
         // Beyond deg/s the numbers do not tell them apart.
-        let rest = if unit == Some(&RateUnit::DegreesPerSecond) {
-            ""
-        } else {
-            ", mrad/s, or --rate-scale for a sensor's counts"
-        };
-        found.extend(unit.map(|unit| format!("the rates are likely in {unit}: give --rate-unit {unit}{rest}")));
+        let is_certain = unit == Some(&RateUnit::DegreesPerSecond);
+        let rest = if is_certain { "" } else { ", mrad/s, or --rate-scale for a sensor's counts" };
+        found.extend(unit.map(|unit| rates_in(unit) + rest));
     }
-    if found.is_empty() {
-        found.push("give the units with --time-unit and --rate-unit, or with --rate-scale".to_owned());
-    }
-    found.join("; or ")
+    found
 }

@@ -40,10 +40,11 @@ impl Stamp {
     /// begin with its year is left out.
     pub fn clock(text: &str) -> Option<Self> {
         let text = text.trim().trim_matches('"').to_uppercase().replace(',', ".");
+        let text = text.trim_end_matches("UTC").trim_end_matches("GMT").trim_end();
         let (text, afternoon) = match (text.strip_suffix("AM"), text.strip_suffix("PM")) {
             (Some(text), _) => (text.trim(), Some(0)),
             (_, Some(text)) => (text.trim(), Some(12)),
-            _ => (text.as_str(), None),
+            _ => (text, None),
         };
         let (date, clock) = text.rsplit_once(['T', ' ']).unwrap_or(("", text));
         // The offset from UTC is the same at every row.
@@ -108,6 +109,7 @@ mod tests {
             ("2026-11-28 12:00:00,250+02:00", "2026-11-28 12:00:00,500+02:00", 0.25),
             ("2026/11/28 9:05:01-05:00", "2026/11/28 9:05:02-05:00", 1.0),
             ("28.11.2026 12:00:00", "28.11.2026 12:00:01", 1.0),
+            ("2026-11-28 12:00:00 UTC", "2026-11-28 12:00:01 UTC", 1.0),
             ("11:59:59 AM", "12:00:01 PM", 2.0),
             ("12:00:00:100", "12:00:00:350", 0.25),
             ("59:59.75", "1:00:00", 0.25),

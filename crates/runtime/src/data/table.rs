@@ -10,7 +10,7 @@ const LINES: usize = 200;
 /// Texts that begin a comment.
 pub const COMMENTS: [&str; 3] = ["#", "%", "//"];
 /// Cells without a value.
-const UNKNOWN: [&str; 9] = ["", "NA", "N/A", "na", "n/a", "null", "NULL", "None", "nan"];
+const UNKNOWN: [&str; 11] = ["", "-", "--", "NA", "N/A", "na", "n/a", "null", "NULL", "None", "nan"];
 
 /// The form of a table.
 #[derive(Debug, Clone, PartialEq)]
@@ -56,14 +56,38 @@ pub fn is_decimal_comma(cell: &str) -> bool {
     whole.is_some_and(|_| cell.replacen(',', ".", 1).parse::<f64>().is_ok())
 }
 
-/// Joins runs of spaces and tabs in a line.
-fn joined(line: &str) -> String {
-    line.split_whitespace().collect::<Vec<_>>().join(" ")
+/// Returns true if commas group the digits of the rows: three follow each, and smaller numbers in the same column have none.
+pub fn groups_digits<'a>(rows: impl Iterator<Item = &'a str>, separator: u8) -> bool {
+    let mut columns: Vec<[bool; 2]> = Vec::new();
+    for row in rows {
+        for (column, cell) in cells(row, separator).iter().enumerate().filter(|(_, cell)| number(cell, true).is_some())
+        {
+            columns.resize(columns.len().max(column + 1), [false; 2]);
+            let group = cell.split_once(',').map(|(whole, part)| {
+                let digits = whole.trim_start_matches(['-', '+']);
+                part.len() == 3 && (1..=3).contains(&digits.len()) && !digits.starts_with('0')
+            });
+            match group {
+                Some(false) => return false,
+                Some(true) => columns[column][0] = true,
+                None => columns[column][1] = true,
+            }
+        }
+    }
+    columns.contains(&[true; 2])
 }
 
-/// Returns the cells of a line.
+/// Returns the cells of a line. Only quotes need the reader of CSV, whose construction takes far longer than a line.
 pub fn cells(line: &str, separator: u8) -> Vec<String> {
-    let line = if separator == b' ' { joined(line) } else { line.to_owned() };
+    match (line.contains('"'), separator) {
+        (false, b' ') => line.split_whitespace().map(str::to_owned).collect(),
+        (false, _) => line.split(char::from(separator)).map(|cell| cell.trim().to_owned()).collect(),
+        (true, b' ') => quoted(&line.split_whitespace().collect::<Vec<_>>().join(" "), separator),
+        (true, _) => quoted(line, separator),
+    }
+}
+
+fn quoted(line: &str, separator: u8) -> Vec<String> {
     let mut builder = ReaderBuilder::new();
     builder.delimiter(separator).trim(Trim::All).has_headers(false).flexible(true).buffer_capacity(256);
     let record = builder.from_reader(line.as_bytes()).into_records().next();

@@ -67,8 +67,8 @@ fn a_log_without_header_is_read_by_numbers() {
     let options = Options {
         time: Some("1".to_owned()),
         rates: Some(["4", "3", "-"].map(str::to_owned)),
-        header: false,
-        needed: [true, true, false],
+        unnamed: true,
+        may_lack: [false, false, true],
         ..Options::default()
     };
     let (entries, counts) = entries("0,9,2,1\n0.01,9,,1\n0.02,9,NaN,1\n0.03,9,2,1\n", &options);
@@ -91,7 +91,7 @@ fn an_invalid_log_is_refused_with_place_reason_and_remedy() {
     for (text, words) in [
         ("", "it has no row of numbers"),
         ("t_s,wx,wy,wz\n", "it has no row of numbers"),
-        ("t_s,wx,wy,wz\n0,0,1,5,2,0,3,0\n", "log.csv:2: the row has 8 cells, the first one has 4"),
+        ("t_s,wx,wy,wz\n0,0,1,5,2,0,3,0\n", "log.csv:2: the row has 8 cells in place of 4"),
         ("t_s,wx,wy,wz\n0,1,2,3\n0.1,1,2\n", "log.csv:3: the row has 3 cells"),
         ("t_s,wx,wy,wz\n0,1,2,3\n\n0.1,1,two,3\n", "log.csv:4: column wy: `two` is not a number"),
         ("t_s,wx,wy,wz\n0,inf,2,3\n", "`inf` is not finite"),
@@ -99,7 +99,10 @@ fn an_invalid_log_is_refused_with_place_reason_and_remedy() {
         ("t_s,wx,wy,wz\n1e300,1,2,3\n", "out of the range of time stamps"),
         ("t_s,wx,wy,wz\n12:30:01,1,2,3\n12:30,1,2,3\n", "column t_s: `12:30` is not a time of day"),
         ("t,wx,wy,wz\n0,1,2,3\n10020000,1,2,3\n20040000,1,2,3\n", "give --time-unit ns"),
+        ("SampleTimeFine,Gyr_X,Gyr_Y,Gyr_Z\n0,500,2,3\n10000,500,2,3\n20000,500,2,3\n", "give --time-unit us"),
+        ("SampleTimeFine,Gyr_X,Gyr_Y,Gyr_Z\n0,9,6,8\n100,9,6,8\n200,9,6,8\n", "the rate of a counter with --rate-hz"),
         ("t_ms;wx;wy;wz\n12,345;1.5;2.5;3\n12,355;1.5;2.5;3\n", "`12,345` has a comma, and others a decimal point"),
+        ("t_ms;wx;wy;wz\n0;999;2;3\n10;1,001;2;3\n", "commas group the digits"),
         ("\0\0", "the file is not text"),
         ("0,1,2,3\n1,1,2,3\n", "if it has no header say so"),
     ] {

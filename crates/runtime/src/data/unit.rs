@@ -36,21 +36,19 @@ impl TimeUnit {
 
     /// Parses a unit: `s`, `ms`, `us`, `ns`, or the word.
     pub fn parse(name: &str) -> Option<Self> {
-        Some(match name.trim().to_lowercase().as_str() {
-            "s" | "sec" | "secs" | "second" | "seconds" | "с" | "сек" => Self::Seconds,
-            "ms" | "msec" | "msecs" | "millis" | "millisec" | "millisecond" | "milliseconds" | "мс" => {
-                Self::Milliseconds
-            }
-            // The last ones are UTF-8 and the code page 437, read as Latin-1.
-            "us" | "µs" | "μs" | "usec" | "usecs" | "micros" | "microsec" | "microsecond" | "microseconds" | "мкс"
-            | "âµs" | "î¼s" | "æs" => Self::Microseconds,
-            "ns" | "nsec" | "nsecs" | "nanos" | "nanosec" | "nanosecs" | "nanosecond" | "nanoseconds" | "нс" => {
-                Self::Nanoseconds
-            }
-            _ => return None,
-        })
+        let name = name.trim().to_lowercase();
+        let found = TIMES.iter().position(|words| words.split(' ').any(|word| word == name));
+        found.map(|index| Self::NUMBERS[index])
     }
 }
+
+/// The spellings of [`TimeUnit::NUMBERS`]; the last ones of µs are UTF-8 and the code page 437, read as Latin-1.
+const TIMES: [&str; 4] = [
+    "s sec secs second seconds с сек",
+    "ms msec msecs millis millisec millisecond milliseconds мс",
+    "us µs μs usec usecs micros microsec microsecond microseconds мкс âµs î¼s æs",
+    "ns nsec nsecs nanos nanosec nanosecs nanosecond nanoseconds нс",
+];
 
 impl fmt::Display for TimeUnit {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -207,39 +205,16 @@ mod tests {
     fn units_are_read_as_people_write_them() {
         use RateUnit::*;
         for (unit, spellings) in [
-            (
-                RadiansPerSecond,
-                &["rad/s", "rad_s", "rad s^-1", "rad s⁻¹", "rad·s-1", "rad/sec", "Radians per second"][..],
-            ),
-            (
-                DegreesPerSecond,
-                &["deg/s", "dps", "DPS", "°/s", "º/s", "˚/s", "¡/s", "Â°/s", "degrees/second", "град/с"],
-            ),
-            (MillidegreesPerSecond, &["mdps", "mdeg/s", "m°/s", "millidegrees per second"]),
-            (MilliradiansPerSecond, &["mrad/s", "mrad", "millirad/s"]),
-            (RevolutionsPerMinute, &["rpm", "rev/min", "turns per minute", "r/min", "U/min", "tr/min"]),
-            (DegreesPerSecond, &["¡ã/s", "⁰/s", "degs"]),
-            (RevolutionsPerSecond, &["rev/s", "turns/s"]),
+            (RadiansPerSecond, "rad/s|rad_s|rad s^-1|rad s⁻¹|rad·s-1|rad/sec|Radians per second"),
+            (DegreesPerSecond, "deg/s|dps|DPS|°/s|º/s|˚/s|¡/s|Â°/s|degrees/second|град/с|¡ã/s|⁰/s|degs"),
+            (MillidegreesPerSecond, "mdps|mdeg/s|m°/s|millidegrees per second"),
+            (MilliradiansPerSecond, "mrad/s|mrad|millirad/s"),
+            (RevolutionsPerMinute, "rpm|rev/min|turns per minute|r/min|U/min|tr/min"),
+            (RevolutionsPerSecond, "rev/s|turns/s"),
         ] {
-            spellings.iter().for_each(|text| assert_eq!(RateUnit::parse(text), Some(unit), "{text}"));
+            spellings.split('|').for_each(|text| assert_eq!(RateUnit::parse(text), Some(unit), "{text}"));
         }
-        for text in [
-            "",
-            "/s",
-            "\u{fffd}/s",
-            "?/s",
-            "rps",
-            "rad/s^2",
-            "rad/s2",
-            "rad/s/s",
-            "deg/ms",
-            "Hz",
-            "turn",
-            "rev",
-            "Grad/s",
-            "arcsec",
-            "min",
-        ] {
+        for text in "|/s|\u{fffd}/s|?/s|rps|rad/s^2|rad/s2|rad/s/s|deg/ms|Hz|turn|rev|Grad/s|arcsec|min".split('|') {
             assert_eq!(RateUnit::parse(text), None, "{text}");
         }
         for (text, rad_s) in [
@@ -256,11 +231,11 @@ mod tests {
             let found = RateUnit::parse(text).map_or(f64::NAN, RateUnit::rad_s);
             assert!((found / rad_s - 1.0).abs() < 1e-12, "{text}: {found}");
         }
-        for (text, unit) in
-            [("µs", TimeUnit::Microseconds), ("Âµs", TimeUnit::Microseconds), ("MS", TimeUnit::Milliseconds)]
-        {
-            assert_eq!(TimeUnit::parse(text), Some(unit), "{text}");
-        }
-        assert_eq!(TimeUnit::parse("min"), None);
+        let times = ["µs", "Âµs", "MS", "s"].map(TimeUnit::parse);
+        assert_eq!(
+            times,
+            [TimeUnit::Microseconds, TimeUnit::Microseconds, TimeUnit::Milliseconds, TimeUnit::Seconds].map(Some)
+        );
+        assert_eq!(["", "min"].map(TimeUnit::parse), [None; 2]);
     }
 }

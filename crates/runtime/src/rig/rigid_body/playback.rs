@@ -150,33 +150,28 @@ const NAMES_LISTED: usize = 12;
 
 impl RawPlayback {
     fn options(&self) -> Result<Options, PlaybackError> {
-        let unit = |name: &Option<String>, quantity: &'static str| name.clone().map(|name| (name, quantity));
-        let time_unit = unit(&self.time_unit, "of time: s, ms, us or ns");
-        let rate_unit = unit(&self.rate_unit, "of angular velocity: rad/s, deg/s, mdps, mrad/s, rpm or rev/s");
+        let unknown = |name: &str, quantity| PlaybackError::Unit(name.to_owned(), quantity);
+        let time = |name: &str| TimeUnit::parse(name).ok_or_else(|| unknown(name, "of time: s, ms, us or ns"));
+        let rates = "of angular velocity: rad/s, deg/s, mdps, mrad/s, rpm or rev/s";
+        let rate = |name: &str| RateUnit::parse(name).ok_or_else(|| unknown(name, rates));
+        let (time_unit, rate_unit) = (self.time_unit.as_deref().map(time), self.rate_unit.as_deref().map(rate));
         let number = |name: &'static str, given: Option<f64>| match given {
             Some(number) if !(number.is_finite() && number > 0.0) => {
                 Err(DataError::Option { name, reason: format!("{number} is out of range; give a number above 0") })
             }
             given => Ok(given),
         };
-        let unknown = |(name, quantity): (String, &'static str)| PlaybackError::Unit(name, quantity);
         Ok(Options {
             topic: self.topic.clone(),
             time: self.time.clone(),
             rates: self.rates.clone(),
-            time_unit: time_unit
-                .map(|named| TimeUnit::parse(&named.0).ok_or_else(|| unknown(named)))
-                .transpose()?
-                .or(number("rate_hz", self.rate_hz)?.map(TimeUnit::Count)),
-            rate_unit: rate_unit
-                .map(|named| RateUnit::parse(&named.0).ok_or_else(|| unknown(named)))
-                .transpose()?
-                .or(number("rate_scale", self.rate_scale)?.map(RateUnit::Scale)),
+            time_unit: time_unit.transpose()?.or(number("rate_hz", self.rate_hz)?.map(TimeUnit::Count)),
+            rate_unit: rate_unit.transpose()?.or(number("rate_scale", self.rate_scale)?.map(RateUnit::Scale)),
             by: self.by.clone(),
             gap_s: self.gap_s,
-            header: !self.headerless.unwrap_or(false),
+            unnamed: self.headerless.unwrap_or(false),
             skip: self.skip.unwrap_or(0),
-            needed: [true; 3],
+            may_lack: [false; 3],
             cut: self.between_s.map_or(Cut::Whole, |between| Cut::Between(vec![between])),
         })
     }
