@@ -15,8 +15,8 @@ def controller(tick, inputs, outputs):
         outputs.command.acceleration_rad_s2 = LAW.command(inputs.estimate.omega_rad_s, measured.omega_rad_s, measured.applied_rad_s2)
 
 
-# Time in which a failure ends a run even on a busy machine, s: 0.2 on an idle one. All timeouts that tests set are longer.
-SOON_S = 25
+# Time in which a failure ends a run even on a busy machine, s: 0.2 on an idle one, 2.05 at a load of 25. All timeouts that tests set are longer.
+SOON_S = 10
 # Parameters of the scenarios of examples/cart-pole and examples/motor-pair.
 GAIN = (-9.213, -9.695, -56.31, -12.66)
 INERTIA_KG_M2, FRICTION_N_M_S, TORQUE_N_M_PER_A = 1e-3, 2e-3, 5e-2
