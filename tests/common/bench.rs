@@ -106,12 +106,16 @@ impl Bench {
 
     /// Waits for the seat file of an external role and returns its path.
     pub fn await_seat(&self, role: &str) -> PathBuf {
-        await_some(|| self.domains().iter().map(|domain| seat_path(domain, role)).find(|seat| seat.is_file()))
+        await_some(|| self.joinable().map(|domain| seat_path(&domain, role)).find(|seat| seat.is_file()))
     }
 
     /// Waits for a domain that other processes can join.
     pub fn await_domain(&self) -> PathBuf {
-        await_some(|| self.domains().into_iter().find(|domain| domain.join("scenario.toml").exists()))
+        await_some(|| self.joinable().next())
+    }
+
+    fn joinable(&self) -> impl Iterator<Item = PathBuf> {
+        self.domains().into_iter().filter(|domain| domain.join("scenario.toml").exists())
     }
 
     /// Returns the domains in this bench's runtime directory.

@@ -62,10 +62,10 @@ pub fn prepare(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain) -> Res
         write_whole(&path, results.as_os_str().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
     }
     share_changes(scenario, domain)?;
-    // After the files that a process looks for once it has the scenario.
+    describe_seats(scenario, launch, domain)?;
+    // Last: a process that finds the scenario also finds the other files.
     let path = scenario_path(domain);
-    write_whole(&path, scenario.to_file().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
-    describe_seats(scenario, launch, domain)
+    write_whole(&path, scenario.to_file().as_bytes()).map_err(|source| LaunchError::Write { path, source })
 }
 
 /// Moves the list of received changes into a domain; that of a replay has those of the recorded run.
