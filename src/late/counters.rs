@@ -4,11 +4,12 @@
 
 use super::delay::Delay;
 use super::{Cause, CauseKind, LateKind};
+use crate::runtime::page_fault_ns;
 use crate::telemetry::LateRecord;
+use std::sync::OnceLock;
 
-/// The longest usual time of a page fault, ns: a virtual machine takes some 2 µs. Faults that could take a whole computation at this rate
-/// are its cause.
-const FAULT_NS: u64 = 4_000;
+/// The longest usual time of a page fault, in times of the shortest one.
+const SLOWEST_FAULT: u64 = 4;
 /// Shortest gap in a spin that is blamed on its core, ns.
 const GAP_NS: u64 = 20_000;
 
@@ -38,6 +39,12 @@ impl Rest {
 
 /// Returns the causes of the part of a delay that no input accounts for.
 pub fn causes(delay: &Delay) -> Vec<Cause> {
+    static FAULT_NS: OnceLock<u64> = OnceLock::new();
+    causes_if_faults_take(*FAULT_NS.get_or_init(|| SLOWEST_FAULT * page_fault_ns()), delay)
+}
+
+/// Faults that could take a whole computation, if each took `fault_ns`, are its cause.
+fn causes_if_faults_take(fault_ns: u64, delay: &Delay) -> Vec<Cause> {
     let LateRecord { done_ns, usage, stalled, continued, slept, gap_ns, gap_end_ns, .. } = delay.record;
     if delay.kind() == LateKind::Starved {
         return Vec::new();
@@ -54,7 +61,7 @@ pub fn causes(delay: &Delay) -> Vec<Cause> {
     if continued {
         rest.explain(CauseKind::Stopped, u64::MAX);
     }
-    let faults_ns = usage.minor_faults.saturating_mul(FAULT_NS);
+    let faults_ns = usage.minor_faults.saturating_mul(fault_ns);
     if usage.major_faults > 0 || faults_ns > 0 && faults_ns >= rest.compute_ns {
         let faults_ns = std::mem::take(&mut rest.compute_ns);
         rest.add(CauseKind::PageFault, faults_ns);
@@ -96,7 +103,7 @@ mod tests {
 
     fn of_role(role: RoleId, record: LateRecord) -> Vec<(CauseKind, f64)> {
         let delay = Delay { role, record, period_ns: 1000 * US };
-        let causes = causes(&delay);
+        let causes = causes_if_faults_take(4 * US, &delay);
         let sum: f64 = causes.iter().map(|cause| cause.us).sum();
         assert!(sum <= (delay.ns() - delay.input_ns()) as f64 / 1e3, "{causes:?}");
         causes.into_iter().map(|cause| (cause.kind, cause.us)).collect()

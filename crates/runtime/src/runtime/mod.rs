@@ -55,7 +55,7 @@ pub use role_id::RoleId;
 pub use role_impl::RoleImpl;
 pub use role_inputs::{NewValue, RoleInputs};
 pub use role_values::{CurrentValues, RoleValue, role_values};
-pub use usage::{ThreadUsage, watch_continued};
+pub use usage::{ThreadUsage, page_fault_ns, watch_continued};
 
 use crate::bus::Depths;
 use crate::config::{ClockKind, Settings};
