@@ -358,7 +358,7 @@ fn both_ends_count_losses_and_the_run_meets_its_limits() {
         "--set",
         "accept={sync_error_rad_s_peak=0.05,peak_from_s=3,missed_ticks_max={},starved_ticks_max={},safe_ticks_max={},unscored_ticks_max=\"50 %\"}",
         "--tick-hz",
-        "200",
+        "100",
         "--duration",
         "6",
     ];

@@ -4,6 +4,7 @@ use super::sites::Site;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
 use std::net::{SocketAddr, UdpSocket};
+use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
@@ -56,7 +57,12 @@ impl Proxy {
                 site.enter();
                 let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
                 port_sender.send(socket.local_addr().unwrap().port()).unwrap();
-                std::thread::spawn(move || forward(&socket, to, connection, &stop))
+                std::thread::spawn(move || {
+                    // A network does not wait for other tests. Only root has the privilege.
+                    let tid = rustix::thread::gettid().as_raw_nonzero().to_string();
+                    let _ = Command::new("chrt").args(["-f", "-p", "50", &tid]).output();
+                    forward(&socket, to, connection, &stop)
+                })
             });
             started.join().unwrap()
         });
