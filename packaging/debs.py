@@ -1,0 +1,43 @@
+"""Unpacks Debian's packages for any architecture, without privileges and without installing them."""
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+# Lists and packages of its own, from the sources that apt is configured with.
+CONFIGURATION = """\
+Dir::State::Lists "{apt}/lists";
+Dir::State::status "{apt}/status";
+Dir::Cache "{apt}/cache";
+APT::Architecture "{architecture}";
+APT::Architectures {{ "{architecture}"; }};
+APT::Sandbox::User "";
+Acquire::Languages "none";
+"""
+
+
+def unpack(directory, architecture, package, needed=".*", also=()):
+    """Unpacks a package, those of its dependencies whose names match `needed`, and further packages into a new directory.
+
+    Raises CalledProcessError if a package cannot be downloaded."""
+    unpacked = directory.with_name(f"{directory.name}.unpacked")
+    apt = directory.with_name(f"{directory.name}.apt")
+    for old in [unpacked, apt]:
+        shutil.rmtree(old, ignore_errors=True)
+    for name in ["lists/partial", "cache/archives/partial", "debs"]:
+        (apt / name).mkdir(parents=True)
+    (apt / "status").touch()
+    (apt / "apt.conf").write_text(CONFIGURATION.format(apt=apt, architecture=architecture))
+    options = {"env": os.environ | {"APT_CONFIG": str(apt / "apt.conf")}, "cwd": apt / "debs", "check": True}
+    subprocess.run(["apt-get", "update", "-qq"], **options)
+    words = ["apt-cache", "depends", "--recurse", "--important", package]
+    depends = subprocess.run(words, stdout=subprocess.PIPE, text=True, **options).stdout.split()
+    # Words in angle brackets are names that other packages provide.
+    names = {name for name in depends if re.fullmatch(r"[a-z0-9][a-z0-9.+-]+", name) and re.fullmatch(needed, name)}
+    subprocess.run(["apt-get", "download", "-qq", *sorted(names), *also], **options)
+    for deb in sorted((apt / "debs").glob("*.deb")):
+        subprocess.run(["dpkg-deb", "-x", deb, unpacked], check=True)
+    shutil.rmtree(apt)
+    unpacked.rename(directory)
