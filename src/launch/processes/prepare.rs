@@ -123,3 +123,24 @@ fn require_descriptors(scenario: &Scenario) -> Result<(), LaunchError> {
     let needed = DESCRIPTORS + DESCRIPTORS_PER_ROLE * RoleId::all(scenario).len() as u64;
     if limit < needed { Err(LaunchError::Descriptors { limit, needed }) } else { Ok(()) }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::SHIPPED;
+    use std::sync::atomic::AtomicUsize;
+
+    /// Other processes take the scenario's file as the sign that a domain is whole.
+    #[test]
+    fn the_scenario_is_the_last_file_of_a_domain() {
+        let external = "launch.external=[\"follower\"]".to_owned();
+        let scenario = Scenario::parse(SHIPPED[0].1, "test", &[external]).unwrap();
+        let owned = OwnedDomain::create(1 << 20).unwrap();
+        let domain = owned.domain();
+        // Its file cannot be written.
+        std::fs::create_dir(scenario_path(domain)).unwrap();
+        let signal = AtomicUsize::new(0);
+        assert!(prepare(&scenario, &Launch::new(&signal, &mut |_| {}), domain).is_err());
+        assert!(seat_path(domain.root(), "follower").is_file() && changes_path(domain).is_file());
+    }
+}
