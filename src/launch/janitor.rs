@@ -25,6 +25,8 @@ use std::time::{Duration, SystemTime};
 const CLEAR: u8 = b'c';
 /// Time without an answer after which a janitor is replaced, ns. A clean-up takes some 5 ms per dead process.
 const ANSWER_NS: u64 = 2_000_000_000;
+/// Time from the end of a clean-up to the next of a silent process, ns. Without it, a clean-up would follow the other.
+const PAUSE_NS: u64 = 250_000_000;
 /// The number of janitors that are tried in a row for one request.
 const ATTEMPTS: u32 = 3;
 /// The interval between two checks for unfinished files and new processes.
@@ -73,6 +75,13 @@ impl Janitor {
         // If the janitor died, or is stopped and its pipe full, the check for its answer finds that.
         let _ = self.process.line.write_all(&[CLEAR]);
         self.pending += 1;
+    }
+
+    /// Requests a clean-up from time to time while it is called repeatedly, so that a silent process that has died is noticed.
+    pub fn clear_silent(&mut self) {
+        if !self.is_busy() && monotonic_ns().saturating_sub(self.since_ns) > PAUSE_NS {
+            self.clear_dead();
+        }
     }
 
     /// Returns true while a request is unanswered. To be called repeatedly: it reads the answers.

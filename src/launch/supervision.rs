@@ -415,9 +415,7 @@ impl Member {
             return fail(left());
         }
         // A killed program counts as ended once its files are removed.
-        if !janitor.is_busy() {
-            janitor.clear_dead();
-        }
+        janitor.clear_silent();
         if let (true, Some(host)) = (has_heartbeat, &self.host) {
             return fail(("host-silent", format!("no heartbeat from it and the host {host} for {limit_s} s")));
         }

@@ -13,7 +13,7 @@ use corotate::sample::Message;
 use corotate::scenario::Scenario;
 use corotate::seat::{RoleAddress, RoleError, run_function};
 use std::sync::atomic::{AtomicBool, AtomicUsize};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 type R = RigidBodyRig;
 
@@ -196,24 +196,35 @@ fn an_error_of_the_function_ends_the_run_in_order() {
 }
 
 /// Lockstep waits longer than the heartbeat timeout. If `launch.external_timeout_s` is shorter, the run ends at the tick
-/// of the function, which gets an error.
+/// of the function, which gets an error. Meanwhile the janitor looks for files of dead processes only now and then.
 #[test]
 fn lockstep_waits_for_a_slow_function_up_to_the_external_timeout() {
-    struct Slow;
+    struct Slow {
+        janitor: u32,
+        more: Duration,
+    }
     impl RoleFunction for Slow {
         fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String> {
             if tick.tick == 50 {
-                std::thread::sleep(std::time::Duration::from_secs(3));
+                std::thread::sleep(Duration::from_secs(4));
+                let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.janitor)).unwrap();
+                // The 14th and 15th field: time as user and in the kernel, in hundredths of a second.
+                let used: u64 =
+                    stat.split_whitespace().skip(13).take(2).map(|field| field.parse::<u64>().unwrap()).sum();
+                assert!(used < 100, "the janitor computed for {used} of 400 hundredths of a second");
+                std::thread::sleep(self.more);
             }
             Ok(())
         }
     }
     let brief = ["--clock", "lockstep", "--duration", "0.2", "--set", "supervision.heartbeat_timeout_s=0.2"];
-    for (limit, exit) in [("600.0", 0), ("0.5", 4)] {
+    // The limit is also the time in which the function must connect.
+    for (limit_s, more_s, exit) in [(600, 0, 0), (10, 20, 4)] {
         let bench = Bench::new();
-        let limit = format!("launch.external_timeout_s={limit}");
+        let limit = format!("launch.external_timeout_s={limit_s}");
         let (running, seat) = start_waiting(&bench, &[&brief[..], &["--set", &limit]].concat());
-        let served = run_function(&seat, Box::new(Slow), &AtomicBool::new(false));
+        let slow = Slow { janitor: bench.await_role("janitor"), more: Duration::from_secs(more_s) };
+        let served = run_function(&seat, Box::new(slow), &AtomicBool::new(false));
         let done = running.wait();
         assert_eq!(done.code, Some(exit), "{done:?}");
         let summary = done.json();
