@@ -6,6 +6,7 @@ import pdb
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 import traceback
 from pathlib import Path
@@ -128,16 +129,20 @@ def test_lockstep_waits_for_a_function_in_pdb(tmp_path):
 
 
 def test_lockstep_waits_for_a_slow_function_up_to_the_external_timeout(tmp_path):
-    def slow(tick, inputs, outputs):
+    def slow(tick, inputs, outputs, pause_s=3):
         if tick == 5:
-            time.sleep(3)
+            over.wait(pause_s)
 
+    over = threading.Event()
     brief = {"supervision.heartbeat_timeout_s": 0.5, "duration_s": 0.5}
     ended = run(tmp_path, "lockstep", "thread", slow, set=brief)
     assert ended.summary["incidents"] == [] and ended.summary["books"]["roles"]["controller"]["executed"] == 51
-    limited = {**brief, "launch.external_timeout_s": 0.5}
-    with pytest.raises(corotate.CorotateError, match=r"\b0\.5 s\b") as caught:
-        corotate.run("rigid-pair", set={**ENDLESS, **limited}, roles={"controller": slow}, out=tmp_path / "limited")
+    # The time in which the function must connect, too.
+    limited = {**brief, "launch.external_timeout_s": SOON_S}
+    endless = lambda *tick: slow(*tick, pause_s=300)
+    with pytest.raises(corotate.CorotateError, match=rf"\b{SOON_S} s\b") as caught:
+        corotate.run("rigid-pair", set={**ENDLESS, **limited}, roles={"controller": endless}, out=tmp_path / "limited")
+    over.set()
     [incident] = caught.value.run.summary["incidents"]
     assert (incident["role"], incident["tick"], incident["code"]) == ("controller", 5, "waited-too-long")
     assert caught.value.run.accepted is False

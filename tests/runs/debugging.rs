@@ -61,7 +61,7 @@ fn lockstep_waits_for_a_stopped_role() {
 fn in_real_time_a_stopped_role_is_replaced_and_the_stop_is_named() {
     let bench = Bench::new();
     let options = ["--clock", "realtime", "--duration", "600", "--tick-hz", "100", "--json"];
-    let relaxed = ["--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=0.5"];
+    let relaxed = ["--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=3"];
     let run = bench.start(&[&["run", "rigid-pair"], &options[..], &relaxed].concat());
     let pid = bench.await_ticks("controller");
     send_signal(pid, STOP);

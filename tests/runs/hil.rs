@@ -385,7 +385,7 @@ fn a_follower_without_heartbeats_is_supervised_by_its_samples() {
 #[test]
 fn a_follower_without_heartbeats_that_misses_its_last_ticks_is_not_an_incident() {
     let bench = Bench::new();
-    let brief = ["--duration", "1", "--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=2"];
+    let brief = ["--duration", "1", "--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=5"];
     let (running, _) = start_waiting(&bench, &[&["--clock", "realtime"], &brief[..]].concat());
     let domains = bench.domains();
     let partner = Partner::new(&domains[0], |tick, _| (tick < 990, tick < 990));
@@ -406,7 +406,7 @@ fn a_killed_follower_ends_the_run_with_an_incident() {
     let silent = &["--silent"][..];
     for (clock, options) in [("realtime", &[][..]), ("lockstep", &[]), ("realtime", silent), ("lockstep", silent)] {
         let bench = Bench::new();
-        let endless = ["--duration", "100000", "--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=0.5"];
+        let endless = ["--duration", "100000", "--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=3"];
         let (running, seat) = start_waiting(&bench, &[&["--clock", clock], &endless[..]].concat());
         let domains = bench.domains();
         let follower = start_follower(&bench, &seat, options);
@@ -418,7 +418,7 @@ fn a_killed_follower_ends_the_run_with_an_incident() {
         let incident = &summary["incidents"][0];
         let (code, cause) = (incident["code"].as_str().unwrap(), incident["cause"].as_str().unwrap());
         assert!(CODES.contains(&code) && done.says(code), "{clock} {options:?}: {done:?}");
-        assert!(code == "left" || cause.contains("0.5 s"), "{clock} {options:?}: {incident}");
+        assert!(code == "left" || cause.contains("3 s"), "{clock} {options:?}: {incident}");
         assert_eq!((&incident["role"], &incident["action"]), (&"follower".into(), &"stopped".into()), "{incident}");
         let (name, failure) = junit_cases(&bench).remove(0);
         assert!(name == "run" && failure.is_some_and(|failure| failure.contains(cause)), "{clock} {options:?}");

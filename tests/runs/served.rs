@@ -353,7 +353,7 @@ fn the_program_sees_the_death_of_its_server_and_the_run_ends() {
 #[test]
 fn a_program_that_stops_answering_holds_up_nothing_for_ever() {
     for (clock, limit) in
-        [("lockstep", "launch.external_timeout_s=0.5"), ("realtime", "supervision.heartbeat_timeout_s=0.5")]
+        [("lockstep", "launch.external_timeout_s=5"), ("realtime", "supervision.heartbeat_timeout_s=5")]
     {
         let bench = Bench::new();
         let (running, seat) =
