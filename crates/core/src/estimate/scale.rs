@@ -68,8 +68,9 @@ impl ScaleSurvey {
         let factor = libm::sqrt(xy / xx);
         let explained = xy * xy / (xx * yy);
         let clear = explained > EXPLAINED && 1.0 - explained < UNCERTAIN * UNCERTAIN * explained * self.samples;
-        let alike = |unit: &f64| (1.0 / ALIKE..ALIKE).contains(&(factor / unit));
-        SCALES.into_iter().find(alike).filter(|_| clear)
+        let apart = |unit: &f64| libm::log(factor / unit).abs();
+        let nearest = SCALES.into_iter().min_by(|first, second| apart(first).total_cmp(&apart(second)))?;
+        (clear && apart(&nearest) < libm::log(ALIKE)).then_some(nearest)
     }
 }
 
@@ -103,7 +104,7 @@ mod tests {
             for noise_rad_s in [0.0, 2e-3] {
                 assert_eq!(found(moments, 1.0, 1.0, noise_rad_s), None);
                 for (rates, times, factor) in
-                    [(deg, 1.0, 1.0 / deg), (1e3, 1.0, 1e-3), (1.0, 1e3, 1e-3), (1.0, 1e6, 1e-6)]
+                    [(deg, 1.0, 1.0 / deg), (1e3, 1.0, 1e-3), (1.0, 1e3, 1e-3), (1.0, 1e6, 1e-6), (10.0, 1.0, 0.1)]
                 {
                     assert_eq!(found(moments, rates, times, noise_rad_s), Some(factor), "{moments:?} {rates} {times}");
                 }

@@ -12,8 +12,9 @@ const EXPLAINED: f64 = 0.9;
 const NEGLIGIBLE: f64 = 0.01;
 /// The deviation of a1 + a2 + a3 + a1 a2 a3 from 0, and of a coefficient beyond 1, from which no body has the coefficients.
 const OPEN: f64 = 0.1;
-/// Factors between rates in wrong units, of rate or time, and right ones: deg/s, mdps, mrad/s or ms, us, ns, rpm, rev/s.
-pub(crate) const SCALES: [f64; 7] = [
+/// Factors between rates in wrong units, of rate or time, and right ones: deg/s, mdps, mrad/s or ms, us, ns, rpm, rev/s; and those of
+/// counters, so that none of these is taken for a unit.
+pub(crate) const SCALES: [f64; 11] = [
     core::f64::consts::PI / 180.0,
     core::f64::consts::PI / 180e3,
     1e-3,
@@ -21,6 +22,10 @@ pub(crate) const SCALES: [f64; 7] = [
     1e-9,
     core::f64::consts::TAU / 60.0,
     core::f64::consts::TAU,
+    1e-1,
+    1e-2,
+    1e-4,
+    1e-5,
 ];
 /// The least ratio of the unexplained parts at the wrong and at the right scale, the largest unexplained part at the right one, and
 /// the least at the wrong one where the right one is not that of a unit.

@@ -179,6 +179,12 @@ fn rates_at_another_scale_are_found_by_the_identity() {
             assert!((found / factor - 1.0).abs() < 0.05, "{factor}: {found}, left {parts:?}");
         }
     }
+    // A unit and a counter's interval that differ by 5 %.
+    for factor in [0.1, core::f64::consts::TAU / 60.0] {
+        for noise_rad_s in [0.0, 0.01] {
+            assert_eq!(wrong_scale(&scaled([0.4, 0.8, 1.0], 1.0 / factor, noise_rad_s)), Some(factor), "{noise_rad_s}");
+        }
+    }
     for moments in [[0.4, 0.8, 1.0], [0.93, 0.08, 1.0], [0.97, 0.98, 1.0], [0.5, 0.5, 1.0]] {
         assert_eq!(wrong_scale(&scaled(moments, 1.0, 0.01)), None, "{moments:?}");
     }

@@ -176,7 +176,9 @@ fn stamp_rank(name: &str) -> Option<usize> {
     }
     (0..STAMPS.len()).find(known).or_else(|| {
         let has = |list: &str| words.iter().any(|word| listed(list, word));
-        (has(STAMP_WORDS) && !has(NO_STAMP_WORDS)).then_some(STAMPS.len())
+        let by_word = (has(STAMP_WORDS) && !has(NO_STAMP_WORDS)).then_some(STAMPS.len());
+        // Beside a time of day it has none.
+        by_word.or((stem == "date").then_some(STAMPS.len() + 1))
     })
 }
 
@@ -584,6 +586,8 @@ mod tests {
         assert_eq!(bare.meaning.assumed, ["time", "rate"]);
         let autopilot = found(&["timestamp", "timestamp_sample", "gx", "gy", "gz"], &Options::default()).unwrap();
         assert_eq!(autopilot.time, Some(1));
+        assert_eq!(found(&["date", "wx", "wy", "wz"], &Options::default()).unwrap().time, Some(0));
+        assert_eq!(found(&["date", "time", "wx", "wy", "wz"], &Options::default()).unwrap().time, Some(1));
     }
 
     #[test]

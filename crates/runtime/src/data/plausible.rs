@@ -147,7 +147,14 @@ fn likely(meaning: &Meaning, usual_s: Option<f64>, rate_rad_s: Option<f64>) -> V
     if meaning.assumed.contains(&"time") {
         let own = meaning.time.1.per_second();
         let unit = TimeUnit::NUMBERS[1..].iter().find(|unit| fits(own / unit.per_second(), 1.0));
-        found.extend(unit.map(stamps_in));
+        found.extend(match usual_s.filter(|_| meaning.time.0.eq_ignore_ascii_case("SampleTimeFine")) {
+            // The devices of Xsens count units of 0.1 ms, newer ones of 1 us.
+            Some(..=1000.0) => {
+                Some(format!("the stamps likely count units of 0.1 ms: give --time {} --rate-hz 10000", meaning.time.0))
+            }
+            Some(_) => Some(stamps_in(&TimeUnit::Microseconds)),
+            None => unit.map(stamps_in),
+        });
     }
     if meaning.assumed.contains(&"rate") {
         let own = meaning.rates.1.rad_s();

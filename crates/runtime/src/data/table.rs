@@ -186,10 +186,12 @@ fn headers(before: &[Line<'_>], separator: u8, count: usize) -> Vec<(u64, Vec<St
     let otherwise = before.iter().rev().filter(|line| named(line).len() != count).filter_map(|line| {
         let text = line.comment().unwrap_or(line.text);
         let apart = text.split("  ").map(|name| name.trim().to_owned()).filter(|name| !name.is_empty()).collect();
+        // As in `t [s] wx [rad/s]`.
+        let with_units = cells(&text.replace(" [", "[").replace(" (", "("), b' ');
         let names = SEPARATORS
             .iter()
             .map(|separator| split(line, *separator))
-            .chain([apart])
+            .chain([apart, with_units])
             .find(|names: &Vec<String>| names.len() == count)?;
         Some((line.number, names))
     });
@@ -243,5 +245,7 @@ mod tests {
         }
         let apart = found("#t (s)   wx (rad/s)   wy (rad/s)   wz (rad/s)\n0  1  2  3\n1  1  2  3\n");
         assert_eq!(apart.3, ["t (s)", "wx (rad/s)", "wy (rad/s)", "wz (rad/s)"]);
+        let units = found("# a logger\n# t [ms] p [mdps] q [mdps] r [mdps]\n0 1 2 3\n1 1 2 3\n");
+        assert_eq!(units.3, ["t[ms]", "p[mdps]", "q[mdps]", "r[mdps]"]);
     }
 }
