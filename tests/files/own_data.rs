@@ -163,6 +163,8 @@ fn a_wrong_argument_or_log_is_refused_with_a_code_and_its_place() {
     // Five equal samples determine no body, although zeros would fit them.
     let short = bench.run(&["identify", "good.csv"]);
     assert!(short.code == Some(1) && short.says("log-too-short"), "{short:?}");
+    // Without a step there are no coefficients.
+    assert_eq!(bench.run(&["identify", "good.csv", "--by", "t_s", "--json"]).json()["recursive"], Value::Null);
     assert_eq!(bench.run(&[&["estimate", "good.csv", "--hidden", "z"], &body[..]].concat()).succeeded().code, Some(0));
 }
 

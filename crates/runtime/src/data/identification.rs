@@ -58,9 +58,9 @@ pub struct Identified {
     pub body: Option<TensorFit>,
     /// Least squares of the whole tensor.
     pub tensor: Option<TensorFit>,
-    /// The papers' filter; absent for a body with a wheel, which it does not know.
+    /// The papers' filter; absent if it used no step, and for a body with a wheel, which it does not know.
     pub recursive: Option<RecursiveFit<3>>,
-    /// The papers' filter for an axisymmetric body.
+    /// The papers' filter for an axisymmetric body; absent if it used no step.
     pub axisymmetric: Option<RecursiveFit<1>>,
     /// The damping assumed by the recursive filters, 1/s.
     pub recursive_damping_per_s: f64,
@@ -116,8 +116,8 @@ pub fn identify_logs(paths: &[PathBuf], options: &Options, ways: &Ways) -> Resul
         axes,
         body,
         tensor,
-        recursive: (!motion.has_wheel()).then(|| recursive.all.fit()),
-        axisymmetric: recursive.symmetric.map(|filter| filter.fit()),
+        recursive: Some(recursive.all.fit()).filter(|fit| fit.steps[0] > 0 && !motion.has_wheel()),
+        axisymmetric: recursive.symmetric.map(|filter| filter.fit()).filter(|fit| fit.steps[0] > 0),
         recursive_damping_per_s,
     })
 }
