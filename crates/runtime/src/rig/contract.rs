@@ -355,9 +355,4 @@ impl Context {
     pub(crate) fn every_tick(tick_s: f64) -> Self {
         Self { tick_s, duration_s: 1.0, seed: 1, actuation_delay_ticks: 1, rates: Rates::ALL }
     }
-
-    /// Returns the time between two commands of the controller, s.
-    pub fn controller_period_s(&self) -> f64 {
-        self.rates.controller_ticks as f64 * self.tick_s
-    }
 }
