@@ -16,7 +16,8 @@ fn main() {
     let revision = given.or_else(packaged).or_else(|| git(&["describe", "--always", "--dirty", "--abbrev=12"]));
     let revision = revision.unwrap_or("unknown".to_owned());
     let target = std::env::var("TARGET").unwrap_or("unknown".to_owned());
-    for (name, value) in [("REVISION", revision), ("TARGET", target)] {
+    // Cargo gives these variables to programs and tests that it runs, and so to what they build: none may have the name of one read here.
+    for (name, value) in [("BUILT_REVISION", revision), ("TARGET", target)] {
         println!("cargo::rustc-env=COROTATE_{name}={value}");
     }
     println!("cargo::rerun-if-env-changed=COROTATE_REVISION");

@@ -59,7 +59,7 @@ impl Results {
         Self {
             schema: SCHEMA,
             version: env!("CARGO_PKG_VERSION"),
-            revision: env!("COROTATE_REVISION"),
+            revision: env!("COROTATE_BUILT_REVISION"),
             started_utc: utc(started),
             quick: bench.quick,
             host: MachineInfo::local(),

@@ -91,7 +91,7 @@ impl Head {
         Self {
             schema: SCHEMA.to_owned(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            revision: env!("COROTATE_REVISION").to_owned(),
+            revision: env!("COROTATE_BUILT_REVISION").to_owned(),
             identity,
             shard,
             table,

@@ -29,7 +29,7 @@ pub use sweep::{Collection, NoShard, Shard, Sweep, Swept, merge};
 pub use table::{Axis, AxisKind, End, Find, Margin, MarginPoint, Metric, Parameter, Row, Statistic, Table};
 
 /// Version and revision: the results of one campaign come from one build.
-pub const BUILD: &str = concat!(env!("CARGO_PKG_VERSION"), " ", env!("COROTATE_REVISION"));
+pub const BUILD: &str = concat!(env!("CARGO_PKG_VERSION"), " ", env!("COROTATE_BUILT_REVISION"));
 
 /// The campaigns that ship with the program: name and text.
 pub const SHIPPED: [(&str, &str); 4] = [

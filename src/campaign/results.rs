@@ -126,7 +126,7 @@ pub(super) fn write(
     let summary = Summary {
         schema: SCHEMA,
         version: env!("CARGO_PKG_VERSION"),
-        revision: env!("COROTATE_REVISION"),
+        revision: env!("COROTATE_BUILT_REVISION"),
         identity: campaign.identity(),
         shard,
         counts: &counts,

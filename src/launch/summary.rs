@@ -183,7 +183,7 @@ impl Summary {
         Self {
             schema: SCHEMA.to_owned(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            revision: env!("COROTATE_REVISION").to_owned(),
+            revision: env!("COROTATE_BUILT_REVISION").to_owned(),
             run: scenario.run,
             scenario: scenario.name.clone(),
             clock: scenario.clock.name().to_owned(),

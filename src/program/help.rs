@@ -56,7 +56,7 @@ Example:
 /// Returns the definition of the command line, complete with version and help.
 pub fn line(definition: clap::Command) -> clap::Command {
     let line = named(definition);
-    let short = format!("{} ({})", version(), env!("COROTATE_REVISION"));
+    let short = format!("{} ({})", version(), env!("COROTATE_BUILT_REVISION"));
     let long = format!("{short}\n{}", about_build());
     let overview = overview(&line) + OPTIONS;
     // Leaked once: the process parses one command line.
@@ -124,7 +124,7 @@ fn about_build() -> String {
     let host = MachineInfo::local();
     format!(
         "revision  {}\nfeatures  {}\niceoryx2  {}\ntarget    {}\nhost      {}, {}, {} cores",
-        env!("COROTATE_REVISION"),
+        env!("COROTATE_BUILT_REVISION"),
         if built.is_empty() { format!("none of {}", absent.join(", ")) } else { built.join(", ") },
         iox::VERSION,
         env!("COROTATE_TARGET"),

@@ -307,7 +307,7 @@ fn run_metadata(scenario: &Scenario) -> BTreeMap<String, String> {
     let entries = [
         ("schema", SCHEMA.to_owned()),
         ("version", env!("CARGO_PKG_VERSION").to_owned()),
-        ("revision", env!("COROTATE_REVISION").to_owned()),
+        ("revision", env!("COROTATE_BUILT_REVISION").to_owned()),
         ("scenario_name", scenario.name.clone()),
         ("scenario_hash", format!("{:016x}", xxh3_64(text.as_bytes()))),
         ("scenario", text),
