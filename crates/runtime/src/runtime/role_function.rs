@@ -22,7 +22,7 @@ pub struct TickSamples<'a> {
     /// rejected by its guard.
     pub inputs: &'a [Option<&'a [u64]>],
     /// Values, at this tick, of the scenario's inputs that the role uses, in the order of
-    /// [`role_values`](super::role_values): gains, set points, disturbances.
+    /// [`role_values`](super::role_values()): gains, set points, disturbances.
     pub values: &'a [f64],
     /// Output samples as words without stamps, in the order of the seat description. Initially zero, except `valid`,
     /// whose bits are all set. A truth that stays unchanged takes the measurement's values.
