@@ -6,7 +6,7 @@ use super::error::{MISSING_KEY, UNKNOWN_KEY, most_similar, nearest};
 use super::reader::{Refusal, read};
 use super::{ConfigError, PathError, Place, Problem, RunId, Shape};
 use serde::de::DeserializeOwned;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
@@ -34,7 +34,7 @@ pub struct Document {
     /// The run named in the file's first line.
     run: Option<RunId>,
     /// Top-level keys that were split off; they count as known.
-    elsewhere: Vec<String>,
+    elsewhere: BTreeSet<String>,
     /// In a probe document, the shape of the first type read from it.
     asked: Option<OnceLock<Shape>>,
 }
@@ -77,7 +77,7 @@ impl Document {
             places.insert(path, Place::line(origin, line));
         });
         let run = text.lines().next().and_then(RunId::in_comments_of);
-        let document = Self { table, places, origin: origin.to_owned(), run, elsewhere: Vec::new(), asked: None };
+        let document = Self { table, places, origin: origin.to_owned(), run, elsewhere: BTreeSet::new(), asked: None };
         document.refuse_absurd()?;
         Ok(document)
     }
@@ -160,13 +160,13 @@ impl Document {
     /// Returns a document of a table that was removed from this one.
     pub(super) fn part(&self, table: Table) -> Self {
         let (places, origin) = (self.places.clone(), self.origin.clone());
-        Self { table, places, origin, run: None, elsewhere: Vec::new(), asked: None }
+        Self { table, places, origin, run: None, elsewhere: BTreeSet::new(), asked: None }
     }
 
     /// Creates an empty probe document that records the shape of the first type read from it.
     pub(crate) fn asking() -> Self {
         let (table, places, origin) = (Table::new(), BTreeMap::new(), String::new());
-        Self { table, places, origin, run: None, elsewhere: Vec::new(), asked: Some(OnceLock::new()) }
+        Self { table, places, origin, run: None, elsewhere: BTreeSet::new(), asked: Some(OnceLock::new()) }
     }
 
     /// Returns the shape of the first type read from a probe document.
@@ -439,6 +439,16 @@ mod tests {
         }
         assert_eq!(document.place("b.missing"), Place::line("x.toml", 2), "the table around it");
         assert_eq!(document.place("missing"), "x.toml".into());
+    }
+
+    #[test]
+    fn keys_that_were_split_off_twice_are_named_once() {
+        let mut document = parse(TEXT).unwrap();
+        for keys in [&["b", "d"][..], &["b"]] {
+            let _ = document.split_off(keys);
+        }
+        let unknown = Refusal::UnknownKey { key: "zzz".to_owned(), known: &["a"] };
+        assert_eq!(document.problem(String::new(), &unknown).reason, "unknown key; known here: a, b, d");
     }
 
     #[test]
