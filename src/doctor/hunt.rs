@@ -46,7 +46,8 @@ pub fn hunt(options: &HuntOptions, ended: &AtomicBool, progress: &mut dyn FnMut(
     };
     let late_ns = realtime.late_ns(options.period_ns());
     let steal = Steal::read();
-    let mut hunter = Hunter { ring, period_ns: options.period_ns(), epoch_ns: 0, cores: Vec::new(), ticks: Vec::new() };
+    let mut hunter =
+        Hunter { ring, period_ns: options.period_ns(), epoch_ns: 0, cores: Vec::new(), ticks: Vec::new(), traced: 0 };
     let start = Start::default();
     let probes: Vec<(Wakes, Vec<Grant>)> = scope(|threads| {
         let probes: io::Result<Vec<_>> =
@@ -63,8 +64,9 @@ pub fn hunt(options: &HuntOptions, ended: &AtomicBool, progress: &mut dyn FnMut(
         grants.extend(news);
     }
     let cost = hunter.ring.as_ref().map(TraceRing::cost);
-    let Hunter { epoch_ns, ticks, .. } = hunter;
-    let mut report = HuntReport::new(options, Measured { epoch_ns, late_ns, cores, grants, ticks, cost, note });
+    let Hunter { epoch_ns, ticks, traced, .. } = hunter;
+    let measured = Measured { epoch_ns, late_ns, cores, grants, ticks, traced, cost, note };
+    let mut report = HuntReport::new(options, measured);
     report.late.steal_ms = Steal::read().since_ms(&steal);
     Ok(report)
 }
@@ -116,6 +118,7 @@ struct Hunter {
     epoch_ns: u64,
     cores: Vec<Core>,
     ticks: Vec<LateTick>,
+    traced: u64,
 }
 
 impl Hunter {
@@ -175,6 +178,7 @@ impl Hunter {
             rest = later;
             let window = self.ring.as_mut().map(|ring| ring.around(due_ns, done_ns, self.period_ns));
             let window = window.filter(|window| !window.has_losses());
+            self.traced += window.as_ref().map_or(0, |_| group.iter().map(|(_, wake)| wake.ticks).sum());
             for (core, wake) in group {
                 let delay = Delay { role: RoleId::Plant(*core), record: wake.record, period_ns: self.period_ns };
                 let counted = || causes_by_counters(&delay);
@@ -247,7 +251,7 @@ mod tests {
         let (sender, late) = sync_channel(ROOM);
         let core = Core { number: 3, late, examined: EXAMINED - 2 };
         let mut hunter =
-            Hunter { ring: None, period_ns: MS, epoch_ns: 1000 * MS, cores: vec![core], ticks: Vec::new() };
+            Hunter { ring: None, period_ns: MS, epoch_ns: 1000 * MS, cores: vec![core], ticks: Vec::new(), traced: 0 };
         let waited = |run_delay_ns| Usage { run_delay_ns, ..Usage::default() };
         sender.send(wake(5, 200_000, waited(150_000))).unwrap();
         sender.send(wake(9, 400_000, waited(1000))).unwrap();

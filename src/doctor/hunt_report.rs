@@ -71,6 +71,8 @@ pub struct Measured {
     pub grants: Vec<Grant>,
     /// The examined late wakes, in any order.
     pub ticks: Vec<LateTick>,
+    /// The number of those whose causes are from the kernel's trace.
+    pub traced: u64,
     /// The costs of the trace, if there was one.
     pub cost: Option<TracerCost>,
     /// The reason why there is no trace, with the remedy.
@@ -97,7 +99,7 @@ pub struct HuntReport {
 impl HuntReport {
     /// Creates the report.
     pub fn new(options: &HuntOptions, measured: Measured) -> Self {
-        let Measured { epoch_ns, late_ns, cores, grants, mut ticks, cost, note } = measured;
+        let Measured { epoch_ns, late_ns, cores, grants, mut ticks, traced, cost, note } = measured;
         ticks.sort_by(|a, b| a.tick.cmp(&b.tick).then_with(|| a.role.cmp(&b.role)));
         let mut late = LateReport {
             schema: LATE_SCHEMA.to_owned(),
@@ -110,6 +112,7 @@ impl HuntReport {
             note,
             counted: cores.iter().map(|core| core.late).sum(),
             examined: ticks.iter().map(|late| late.ticks).sum(),
+            traced: Some(traced),
             ticks,
             causes: Vec::new(),
             patterns: Vec::new(),
@@ -203,6 +206,7 @@ mod tests {
             cores: vec![counts(0), counts(1)],
             grants: vec![grant("SCHED_FIFO", "80", granted), grant("core", "0", true), grant("core", "1", true)],
             ticks: taken.chain([late(1, 400, hog)]).collect(),
+            traced: if granted { 21 } else { 0 },
             cost: granted.then_some(TracerCost { cpu_s: 0.1, events: 5, overruns: 0 }),
             note: (!granted).then(|| "no kernel trace: run as root".to_owned()),
         }
@@ -224,6 +228,8 @@ mod tests {
         let json: serde_json::Value = serde_json::from_str(&report.to_json()).unwrap();
         assert_eq!((&json["schema"], &json["late"]["source"]), (&SCHEMA.into(), &"kernel".into()));
         assert_eq!((&json["cores"][1]["core"], &json["cores"][1]["lateness"]["count"]), (&1.into(), &10_000.into()));
+        let text = HuntReport::new(&OPTIONS, Measured { traced: 15, ..measured(true) }).to_string();
+        assert!(text.contains("causes from the kernel's trace for 15, from counters for the others\n"), "{text}");
         // A reader of `late.json` reads it.
         let read = LateReport::parse(json["late"].to_string().as_bytes()).unwrap();
         assert!(read.ticks.is_sorted_by_key(|late| late.tick) && read.ticks.len() == 21 && read.epoch_ns == 7);
@@ -236,7 +242,7 @@ mod tests {
             assert!(text.contains(part), "{part}: {text}");
         }
         assert!(text.ends_with("which tell the kind of a cause\nnote: no kernel trace: run as root\n"), "{text}");
-        let quiet = Measured { cores: Vec::new(), ticks: Vec::new(), ..measured(true) };
+        let quiet = Measured { cores: Vec::new(), ticks: Vec::new(), traced: 0, ..measured(true) };
         let text = HuntReport::new(&OPTIONS, quiet).to_string();
         assert!(text.ends_with("max us\n\n0 late ticks examined; limit 100 us; causes from the kernel's trace\n"));
     }

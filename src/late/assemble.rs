@@ -33,11 +33,13 @@ pub fn report(
     let mut found: HashMap<(u64, usize), Finding> =
         findings.ticks.into_iter().map(|finding| ((finding.role, finding.index), finding)).collect();
     let mut ticks: Vec<(LateTick, Vec<Cause>)> = Vec::new();
+    let mut traced: u64 = 0;
     for report in reports {
         let Some(role) = RoleId::named(scenario, &report.role) else { continue };
         for (index, record) in report.late_ticks.iter().enumerate() {
             let delay = Delay { role, record: *record, period_ns: scenario.period_ns };
             let finding = found.remove(&(role.number(), index));
+            traced = traced.saturating_add(finding.as_ref().map_or(0, |_| record.missed.max(1)));
             ticks.push((
                 late_tick(scenario, &delay, finding.as_ref()),
                 finding.map_or_else(Vec::new, |finding| finding.input_causes),
@@ -62,6 +64,7 @@ pub fn report(
             .map(|ticks| ticks.missed - ticks.scripted.min(ticks.missed) + ticks.starved + ticks.late.unwrap_or(0))
             .sum(),
         examined: ticks.iter().fold(0, |sum, late| sum.saturating_add(late.ticks)),
+        traced: Some(traced),
         ticks,
         causes: Vec::new(),
         patterns: Vec::new(),

@@ -50,6 +50,7 @@ pub fn report() -> LateReport {
         epoch_ns: 0,
         counted: 90,
         examined: ticks.iter().map(|late| late.ticks).sum(),
+        traced: None,
         causes: totals(&ticks),
         ticks,
         steal_ms: [(1, 70.0)].into(),

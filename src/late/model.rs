@@ -48,6 +48,10 @@ pub struct LateReport {
     pub counted: u64,
     /// The number of examined ones. Fewer than counted if there were more than the roles keep.
     pub examined: u64,
+    /// The number of those whose causes are from the kernel's trace; where it lacks events or time was short, they are from counters.
+    /// `None` in files of 0.1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub traced: Option<u64>,
     /// The examined ones, in the order of time; in `summary.json` the worst ten, in a recording the worst thousand.
     pub ticks: Vec<LateTick>,
     /// Totals by cause, the largest sum first.

@@ -60,11 +60,14 @@ pub fn cause_rows(report: &LateReport, most: usize) -> Vec<[String; 4]> {
 
 /// Returns the first line about a run: the number of late ticks, the limit and the source of the causes.
 pub fn header(report: &LateReport, unit: &str) -> String {
-    let source = match report.source {
-        Source::Counters => "counters, which tell the kind of a cause",
-        Source::Kernel => "the kernel's trace",
-    };
     let (counted, examined) = (report.counted, report.examined);
+    let source = match (report.source, report.traced) {
+        (Source::Counters, _) => "counters, which tell the kind of a cause".to_owned(),
+        (Source::Kernel, Some(traced)) if traced < examined => {
+            format!("the kernel's trace for {traced}, from counters for the others")
+        }
+        (Source::Kernel, _) => "the kernel's trace".to_owned(),
+    };
     let number = if counted == examined { counted.to_string() } else { format!("{examined} of {counted}") };
     let part = match report.left_out() {
         0 => String::new(),

@@ -254,6 +254,7 @@ fn json(run: &Run, shown: &[&LateTick], selected: usize) -> String {
         "note": late.note,
         "counted": late.counted,
         "examined": late.examined,
+        "traced": late.traced,
         "selected": selected,
         "ticks": ticks,
         "causes": late.causes,

@@ -240,8 +240,10 @@ fn assert_culprit(
             right(kind, name)
         };
         if trace == "counters" {
+            assert_eq!(report.traced, Some(0));
             assert_named(&late, 0.8, |late| is(of_kind, late));
         } else if has_kernel_trace(&report, what) {
+            assert!(report.traced.is_some_and(|traced| (1..=report.examined).contains(&traced)), "{:?}", report.traced);
             assert_named(&late, 0.95, |late| is(named, late));
             traced = Some(report.clone());
         }
