@@ -10,7 +10,7 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 
 /// Commands that are not run here: first words, and where the command is run or why it cannot be.
-const ELSEWHERE: [(&str, &str); 34] = [
+const ELSEWHERE: [(&str, &str); 35] = [
     ("corotate run pair.toml --host", "it waits for another host; tests/runs/hosts"),
     ("corotate run pair.toml --clock lockstep --debug", "it waits for a debugger; tests/runs/debugging.rs"),
     ("corotate join", "it needs a run to join; tests/runs/hosts"),
@@ -20,6 +20,7 @@ const ELSEWHERE: [(&str, &str); 34] = [
     ("tests/run", "it runs this test"),
     ("cargo install --path . --locked", "tests/run"),
     ("cargo build --release --features", "tests/run builds with them"),
+    ("cargo build --release --config", "it compiles for minutes; tests/run, without these options"),
     ("cargo build --release", "for a board, in firmware/; tests/board"),
     ("cargo bench --bench", "tests/run, short"),
     ("corotate bench", "five minutes; tests/tools/bench.rs, some rows"),
