@@ -3,11 +3,11 @@
 use super::counters;
 use super::delay::Delay;
 use super::findings::{Finding, Findings};
-use super::{Cause, CauseKind, CauseTotal, LateKind, LateReport, LateTick, Pattern, SCHEMA, Source, TickOfRole};
+use super::model::{CauseTotal, LateKind, LateReport, LateTick, Pattern, SCHEMA, Source, TickOfRole};
 use crate::runtime::RoleId;
 use crate::scenario::Scenario;
 use crate::telemetry::RoleReport;
-use corotate_trace::periods;
+use corotate_trace::{Cause, CauseKind, periods};
 use std::collections::{BTreeMap, HashMap};
 
 /// The least part of a delay that is reported as a cause, and the least unexplained part.

@@ -3,9 +3,10 @@
 //! Must not blame a role for a time in which its thread could not run.
 
 use super::delay::Delay;
-use super::{Cause, CauseKind, LateKind};
+use super::model::LateKind;
 use crate::runtime::page_fault_ns;
 use crate::telemetry::LateRecord;
+use corotate_trace::{Cause, CauseKind};
 use std::sync::OnceLock;
 
 /// The longest usual time of a page fault, in times of the shortest one.

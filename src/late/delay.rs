@@ -1,6 +1,6 @@
 //! The delay of a late tick, as its role recorded it: how long, and which part an input accounts for.
 
-use super::LateKind;
+use super::model::LateKind;
 use crate::runtime::RoleId;
 use crate::telemetry::LateRecord;
 

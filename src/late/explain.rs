@@ -1,8 +1,8 @@
 //! The causes of a late tick from the kernel's events around it.
 
 use super::delay::Delay;
-use super::{Cause, CauseKind, LateKind, Slice, SliceKind};
-use corotate_trace::{Duty, Facts, Occupant, Phase, Window};
+use super::model::{LateKind, Slice, SliceKind};
+use corotate_trace::{Cause, CauseKind, Duty, Facts, Occupant, Phase, Window};
 
 /// The time before the due time and after the end of a delay that a timeline shows, ns.
 const MARGIN_NS: u64 = 200_000;

@@ -1,12 +1,12 @@
 //! The findings of the tracing process: the file in which other processes read them.
 
-use super::{Cause, Slice, TracerCost};
+use super::model::{Slice, TracerCost};
 use crate::bus::domain::Domain;
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Trace};
 use crate::scenario::Scenario;
 use crate::seat::{report_path, write_whole};
-use corotate_trace::require_tracefs;
+use corotate_trace::{Cause, require_tracefs};
 use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
 use serde::{Deserialize, Serialize};

@@ -1,9 +1,9 @@
 //! A report with the late ticks of a run of `rigid-pair` on a shared virtual machine, for tests.
 
-use super::{
-    Cause, CauseKind, CauseTotal, LateKind, LateReport, LateTick, Pattern, SCHEMA, Slice, SliceKind, Source,
-    TickOfRole, TracerCost,
+use super::model::{
+    CauseTotal, LateKind, LateReport, LateTick, Pattern, SCHEMA, Slice, SliceKind, Source, TickOfRole, TracerCost,
 };
+use corotate_trace::{Cause, CauseKind};
 
 const PERIOD_US: f64 = 1000.0;
 const LATE_US: f64 = 100.0;

@@ -5,12 +5,13 @@
 use super::assemble::{late_tick, replace_input};
 use super::delay::Delay;
 use super::findings::Finding;
-use super::{CauseKind, LateKind};
+use super::model::LateKind;
 use crate::bus::domain::Domain;
 use crate::runtime::{RoleId, late_log};
 use crate::scenario::Scenario;
 use crate::seat::open_ledger;
 use crate::telemetry::LateLog;
+use corotate_trace::CauseKind;
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 use std::path::PathBuf;

@@ -2,8 +2,8 @@
 //!
 //! All times are µs after the due time of the first tick. Must not keep samples in memory: a recording may be larger.
 
+use super::model::{LateReport, LateTick, SliceKind};
 use super::words::title;
-use super::{LateReport, LateTick, SliceKind};
 use serde_json::{Value, json};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};

@@ -2,7 +2,7 @@
 //!
 //! Decodes the time around a late tick only. Must not wait for the kernel.
 
-use super::TracerCost;
+use super::model::TracerCost;
 use crate::clock::{correction_ns, raw_ns};
 use crate::runtime::usable_cores;
 use corotate_trace::{Event, Instance, Page, TraceError, Window, remove_instances};

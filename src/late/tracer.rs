@@ -3,7 +3,6 @@
 //! It keeps the last seconds of the trace undecoded and decodes the time around a late tick only. Must not delay a role, nor end a run:
 //! without a trace the roles' counters tell the kind of each cause.
 
-use super::Cause;
 use super::delay::Delay;
 use super::explain::{causes, input_causes, slices};
 use super::findings::{Finding, Findings, TRACER, announce_ready, ready_path};
@@ -16,7 +15,7 @@ use crate::scenario::Scenario;
 use crate::seat::{RoleError, join_complete, open_ledger, report_path, write_whole};
 use crate::system::name_thread;
 use crate::telemetry::LateLog;
-use corotate_trace::TraceError;
+use corotate_trace::{Cause, TraceError};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 

@@ -2,7 +2,7 @@
 //!
 //! Must not name a cause that the report does not have.
 
-use super::{LateKind, LateReport, LateTick, Pattern, Source, TickOfRole};
+use super::model::{LateKind, LateReport, LateTick, Pattern, Source, TickOfRole};
 use std::fmt::Write;
 
 /// The unit of delays on a terminal.

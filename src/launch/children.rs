@@ -2,7 +2,7 @@
 //!
 //! The kernel ends a role with its launcher (parent-death signal). Must not leave a zombie.
 
-use super::LaunchError;
+use super::error::LaunchError;
 use super::incident::RoleFailure;
 use super::standstill::is_zombie;
 use crate::bus::domain::Domain;

@@ -2,8 +2,8 @@
 //!
 //! Its owner gives the command, and decides how to react to its end. Must not end a run.
 
-use super::LaunchError;
 use super::children::{RoleProcess, program};
+use super::error::LaunchError;
 use super::incident::RoleFailure;
 use super::janitor::Janitor;
 use crate::system::tell;

@@ -2,8 +2,9 @@
 //!
 //! Must not pass what was not measured: a criterion without all its data is not judged, and neither is the run.
 
+use super::incident::Action;
+use super::outcome::Outcome;
 use super::outcome::{Accounting, StageFigures, links_of};
-use super::{Action, Outcome};
 use crate::config::{ClockKind, TickAmount, TickLimit};
 use crate::fault::{Action as FaultAction, Interruption};
 use crate::runtime::RoleId;

@@ -2,8 +2,8 @@
 //!
 //! No role waits for it; the ticks do, once, until it listens. Its end is not the run's.
 
-use super::LaunchError;
 use super::companion::Companion;
+use super::error::LaunchError;
 use crate::bus::domain::Domain;
 use std::net::SocketAddr;
 use std::path::PathBuf;

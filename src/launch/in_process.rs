@@ -1,8 +1,10 @@
 //! A run in one thread: the same roles over links in memory, or without links where nothing disturbs them. No iceoryx2, no
 //! files, no clock.
 
+use super::error::LaunchError;
 use super::incident::{Action, Incident, Incidents, RoleFailure};
-use super::{Launch, LaunchError, Outcome, Progress};
+use super::options::{Launch, Progress};
+use super::outcome::Outcome;
 use crate::bus::memory::MemoryBus;
 use crate::changes::ReceivedChanges;
 use crate::clock::Grid;

@@ -5,7 +5,7 @@
 //! wait: it requests a clean-up by a byte, polls for the answer, and replaces a janitor that does not answer in time. Must not
 //! touch files of live processes.
 
-use super::LaunchError;
+use super::error::LaunchError;
 use crate::bus::domain::{self, Domain};
 use crate::bus::iox;
 use crate::clock::monotonic_ns;

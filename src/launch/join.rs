@@ -4,10 +4,11 @@
 //! Phases, epoch and credit come from the host that launched. Must not score, nor record.
 
 use super::children::END_LIMIT;
+use super::error::LaunchError;
 use super::incident::Incident;
+use super::options::Launch;
 use super::processes::{Supervisor, prepare};
 use super::relay::{FarEnd, RelayWatch};
-use super::{Launch, LaunchError};
 use crate::bus::domain::{Domain, OwnedDomain};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};

@@ -2,7 +2,9 @@
 //!
 //! Must not be more lenient than the exit code, and always has a case: a run that did not begin is an error.
 
-use super::{Action, Criterion, Summary, exact};
+use super::criteria::{Criterion, exact};
+use super::incident::Action;
+use super::summary::Summary;
 use crate::config::RunId;
 use crate::late::{CauseTotal, LateReport};
 use crate::telemetry::PaceReport;

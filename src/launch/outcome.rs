@@ -2,7 +2,6 @@
 //!
 //! Must not hide anything: a missing measurement is reported as missing, and counters that do not balance are a failure.
 
-use super::Score;
 use super::incident::Incident;
 use super::remains::Remains;
 use crate::config::ClockKind;
@@ -11,6 +10,7 @@ use crate::late::LateReport;
 use crate::record::RecordingReport;
 use crate::runtime::{RoleId, ports};
 use crate::scenario::Scenario;
+use crate::score::Score;
 use crate::telemetry::{Checkpoints, Grant, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, combine};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;

@@ -3,8 +3,8 @@
 //! In lockstep no role runs ahead of it, or of the scorer, by more than the window. Must not let a dead or silent recorder delay
 //! the run.
 
-use super::LaunchError;
 use super::companion::Companion;
+use super::error::LaunchError;
 use super::janitor::Janitor;
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;

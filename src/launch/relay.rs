@@ -2,9 +2,9 @@
 //!
 //! Must not carry anything, nor decide when a run ends; [`super::processes`] does.
 
-use super::LaunchError;
 use super::children::RoleProcess;
 use super::companion::Companion;
+use super::error::LaunchError;
 use super::incident::{Action, Incident, Incidents, RoleFailure};
 use crate::bus::domain::Domain;
 use crate::hosts::{HostEndpoint, HostStatistics, RELAY, far_end_path, ready_path, relay_report_path};

@@ -2,8 +2,8 @@
 //!
 //! One role at a time. Must not judge: [`crate::record`] selects the role's inputs and compares its outputs.
 
-use super::LaunchError;
 use super::children::{END_LIMIT, RoleProcess};
+use super::error::LaunchError;
 use super::janitor::Janitor;
 use super::processes::share_changes;
 use crate::bus::domain::OwnedDomain;

@@ -16,7 +16,9 @@
 //!
 //! An error is JSON: `invalid` if the scenario is, and `errors`, each a text and a code.
 
-use super::{Claim, Steps, Summary, claim, make_directory, make_latest, new_run, write_run};
+use super::results::{Claim, claim, make_directory, make_latest, new_run};
+use super::steps::Steps;
+use super::summary::{Summary, write_run};
 use crate::config::{ClockKind, ConfigError};
 use crate::failure::Failure;
 use crate::runtime::{RoleId, ports};

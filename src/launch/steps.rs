@@ -2,7 +2,8 @@
 //!
 //! Must not decide anything for the controller.
 
-use super::{LaunchError, Outcome};
+use super::error::LaunchError;
+use super::outcome::Outcome;
 use crate::bus::Port;
 use crate::bus::memory::MemoryBus;
 use crate::bus::{BusError, Reader, Signal, WordReader};

@@ -2,7 +2,6 @@
 //!
 //! Must not hide anything: a missing measurement is reported as missing.
 
-use super::Score;
 use super::criteria::{Criterion, Judge, accepted, verdict};
 use super::incident::{Action, Incident};
 use super::outcome::{Accounting, Outcome, StageFigures, State, incident_figures, latencies};
@@ -17,6 +16,7 @@ use crate::record::RecordingReport;
 use crate::rig::Figure;
 use crate::runtime::RoleId;
 use crate::scenario::{Scenario, claims};
+use crate::score::Score;
 use crate::serial::LineCounters;
 use crate::system::utc;
 use crate::telemetry::{Grant, MachineInfo, PaceReport, RoleReport, WatchReport, write_hgrm, write_hlog};

@@ -2,8 +2,8 @@
 //!
 //! Must not decide when a run ends; [`super::processes`] does.
 
-use super::LaunchError;
 use super::children::{END_LIMIT, RoleProcess};
+use super::error::LaunchError;
 use super::incident::{Action, Incident, Replacement, RoleFailure};
 use super::janitor::Janitor;
 use super::standstill::{Standstill, standstill};

@@ -1,7 +1,9 @@
 //! The results of a run on the screen.
 
+use super::criteria::{exact, short};
+use super::incident::Incident;
 use super::outcome::{LinkCounters, State};
-use super::{Incident, Summary, exact, short};
+use super::summary::Summary;
 use crate::analysis::digits;
 use crate::hosts::{NetworkStatistics, Silence};
 use crate::late::{late_table, pattern};

@@ -2,8 +2,8 @@
 //!
 //! The ticks wait for it once, until it records. Its end is not the run's.
 
-use super::LaunchError;
 use super::companion::Companion;
+use super::error::LaunchError;
 use super::janitor::Janitor;
 use crate::bus::domain::Domain;
 use crate::late::{Findings, LateReport, Steal, TRACER, findings, ready_path, report, trace_refusal, wants_trace};

@@ -2,7 +2,7 @@
 //!
 //! Takes them from the list of the run: no sample of the signal can be lost. The recorder's metadata has them too, for replays.
 
-use super::RecordError;
+use super::error::RecordError;
 use super::taps::{Channel, MessageSink, about};
 use crate::bus::Port;
 use crate::changes::ReceivedChanges;

@@ -3,7 +3,7 @@
 //! Compares values at ticks that both recordings have, and counts the ticks that only one has. Ignores stamps, because
 //! times and generations differ between any two runs.
 
-use super::RecordError;
+use super::error::RecordError;
 use super::reader::{Recording, Track};
 use crate::sample::{FieldKind, Stamp};
 

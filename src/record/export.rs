@@ -11,7 +11,7 @@ mod table;
 pub(crate) use parquet::{Cell, ColumnKind, RowGroups};
 
 use self::table::Table;
-use super::RecordError;
+use super::error::RecordError;
 use super::reader::{Recording, SignalInfo};
 use crate::files;
 use crate::sample::Stamp;

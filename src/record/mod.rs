@@ -2,8 +2,8 @@
 //!
 //! | file | duty |
 //! |---|---|
-//! | `layout` | the layout of a sample as a ROS 2 message definition |
 //! | `writer` | writes the MCAP file: chunks of bounded age, full disks |
+//! | `changes` | writes the changes of inputs as messages of the signal `input`, so that foreign readers of a recording see them |
 //! | `taps` | takes every sample of a run off a bus, and counts it |
 //! | `recorder` | writes a run to a file, and compares its counters with those of the roles |
 //! | `process` | runs the recorder as a process beside a loop |
@@ -11,12 +11,14 @@
 //! | `script` | reconstructs the ticks that a role executed, and their inputs |
 //! | `replay` | feeds recorded inputs to the live roles, and compares their outputs bit for bit |
 //! | `diff` | compares two recordings |
+//! | `error` | the errors |
 //! | `export` | writes tables as CSV and, with the feature of that name, Parquet |
 //!
 //! Must not change a sample, nor delay a loop, except by its credit in lockstep.
 
 mod changes;
 mod diff;
+mod error;
 mod export;
 mod process;
 mod reader;
@@ -27,6 +29,7 @@ mod taps;
 mod writer;
 
 pub use diff::{Comparison, SignalDiff, Tolerances, ValueDiff, diff};
+pub use error::RecordError;
 #[cfg(feature = "parquet")]
 pub use export::export_parquet;
 #[cfg(feature = "parquet")]
@@ -40,129 +43,3 @@ pub use replay::{Comparer, Difference, Inlets, Outlets, RoleReplay, replay_in_pr
 pub use script::{InputScript, Item, Limit, Script, Step};
 #[cfg(feature = "foxglove")]
 pub(crate) use taps::{Channel, MessageSink, Taps};
-
-use crate::bus::BusError;
-use crate::bus::domain::DomainError;
-use crate::config::ConfigError;
-use crate::runtime::NodeError;
-use crate::seat::RoleError;
-use crate::system::remedy;
-use std::io;
-use std::path::PathBuf;
-
-/// A failure to write, read or replay a recording.
-#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
-#[strum(serialize_all = "kebab-case")]
-pub enum RecordError {
-    /// The run could not be joined.
-    #[error(transparent)]
-    #[strum(transparent)]
-    Run(#[from] RoleError),
-    /// The domain is invalid.
-    #[error(transparent)]
-    #[strum(transparent)]
-    Domain(#[from] DomainError),
-    /// A link failed.
-    #[error(transparent)]
-    #[strum(transparent)]
-    Bus(#[from] BusError),
-    /// A role cannot go on.
-    #[error(transparent)]
-    #[strum(transparent)]
-    Node(#[from] NodeError),
-    /// The disk is full.
-    #[error("the disk is full: {} ends early but is readable ({source}); free space, or record elsewhere with --out", path.display())]
-    #[strum(serialize = "disk-full")]
-    Full {
-        /// The recording.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-    /// The file cannot be written.
-    #[error("cannot write {}: {source}; the file ends with its last whole chunk, and is readable without an index", path.display())]
-    #[strum(serialize = "cannot-write")]
-    Write {
-        /// The recording.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-    /// The file cannot be read.
-    #[error("cannot read {}: {source}; {}", path.display(), remedy(source))]
-    #[strum(serialize = "cannot-read")]
-    Read {
-        /// The recording.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-    /// The file is not a recording of corotate.
-    #[error("{} is not a corotate recording: {reason}; make one with `corotate run --record`", path.display())]
-    #[strum(serialize = "not-a-recording")]
-    NotARecording {
-        /// The file.
-        path: PathBuf,
-        /// The first deviation from the format.
-        reason: String,
-    },
-    /// The file was changed after it was written.
-    #[error(
-        "{} is damaged: {reason}; use another copy. --accept-incomplete reads the part before the damage, and still fails",
-        path.display()
-    )]
-    #[strum(serialize = "damaged-recording")]
-    Damaged {
-        /// The recording.
-        path: PathBuf,
-        /// The first damage.
-        reason: String,
-    },
-    /// The recording lacks a part of its run.
-    #[error("{} is incomplete: {missing}; use the recorded part with --accept-incomplete", path.display())]
-    #[strum(serialize = "incomplete-recording")]
-    Incomplete {
-        /// The recording.
-        path: PathBuf,
-        /// The missing part.
-        missing: String,
-    },
-    /// The scenario in the recording is invalid in this version.
-    #[error("this version refuses the scenario in {}: {source}", path.display())]
-    #[strum(serialize = "refused-scenario")]
-    Scenario {
-        /// The recording.
-        path: PathBuf,
-        /// The reason.
-        source: Box<ConfigError>,
-    },
-    /// The layouts of a signal differ.
-    #[error(
-        "{service} was recorded as {recorded}, but this version has {ours}; replay it with the version that recorded it"
-    )]
-    #[strum(serialize = "other-layout")]
-    Layout {
-        /// The signal.
-        service: String,
-        /// The layout in the recording.
-        recorded: String,
-        /// The layout in this version, or in the second recording.
-        ours: String,
-    },
-    /// The recording lacks a signal of the scenario.
-    #[error("{} has no signal {service}; record the run again with this version", path.display())]
-    NotRecorded {
-        /// The recording.
-        path: PathBuf,
-        /// The signal.
-        service: String,
-    },
-    /// The recording has no such role.
-    #[error("--role {role}: unknown role; choose one of: {known}, all")]
-    UnknownRole {
-        /// The given name.
-        role: String,
-        /// The roles in the recording.
-        known: String,
-    },
-}

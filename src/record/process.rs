@@ -4,7 +4,7 @@
 //! avoids the cores that the scenario names for roles. Must not keep a role waiting: a sample that it cannot take in time is
 //! lost, and reported. In lockstep the launcher gives no credit beyond the ticks that the recorder has taken.
 
-use super::RecordError;
+use super::error::RecordError;
 use super::recorder::{JOINING, RECORDER, Recorder, RecordingReport};
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;

@@ -5,7 +5,7 @@
 //! [`Recording::damage`] reports changes, [`Recording::incomplete`] missing parts. Must not allocate more than the file
 //! can fill, nor use a sample whose checksum is wrong.
 
-use super::RecordError;
+use super::error::RecordError;
 use super::recorder::{CHANGES, END, INPUTS, LATE, LATE_REPORT, RUN, SCHEMA, SignalReport, layouts};
 use super::writer::{CHECKSUM, checksum};
 use crate::bus::Signal;

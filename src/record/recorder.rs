@@ -1,7 +1,7 @@
 //! Writes all samples of a run to a file, and compares its counters with those of the roles. Must not judge a sample.
 
-use super::RecordError;
 use super::changes::ChangeTap;
+use super::error::RecordError;
 use super::taps::{SignalCounters, Taps};
 use super::writer::Writer;
 use crate::bus::AnyBus;

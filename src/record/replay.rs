@@ -3,7 +3,7 @@
 //! Drives the role in one thread; [`crate::launch`] drives a process with the same script and comparison. Does not compare
 //! the time of sending and the generation, which are not outputs of the role.
 
-use super::RecordError;
+use super::error::RecordError;
 use super::reader::{Recording, Track};
 use super::script::{Limit, Script, Step};
 use crate::bus::memory::MemoryBus;

@@ -6,7 +6,7 @@
 //! fault withheld samples, the role's final counters decide. From the first tick that the recording leaves open, nothing is
 //! claimed ([`Limit`]). Must not run a role.
 
-use super::RecordError;
+use super::error::RecordError;
 use super::reader::{Recording, SignalInfo, Track};
 use crate::bus::Port;
 use crate::clock::Grid;

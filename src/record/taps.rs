@@ -3,7 +3,7 @@
 //! Passes on all samples unchanged except warm-up: duplicates, late and malformed samples too. Must not judge a sample, nor
 //! depend on the sink.
 
-use super::RecordError;
+use super::error::RecordError;
 use crate::bus::Port;
 use crate::bus::{AnyBus, BusError, Reader, WordReader};
 use crate::clock::{Grid, monotonic_ns};

@@ -5,7 +5,7 @@
 //! whole chunk. Every metadata record has its own checksum: it is outside of the chunks, and a truncated file has no
 //! checksum over its whole. Must not interpret samples.
 
-use super::RecordError;
+use super::error::RecordError;
 use super::taps::{Channel, MessageSink};
 use crate::clock::monotonic_ns;
 use crate::files;

@@ -19,6 +19,7 @@
 //! | `campaign` | the page of a campaign |
 //! | `axis`, `frame`, `chart`, `panels` | charts as SVG |
 //! | `html`, `page` | HTML |
+//! | `error` | the errors of reports |
 //!
 //! Must not judge a run: the verdict comes from its summary. Must not omit anything silently: a remark names what is missing.
 

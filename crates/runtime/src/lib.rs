@@ -18,6 +18,7 @@
 //! | `telemetry` | histograms and counters, exported after the loop |
 //! | `bus` | links between roles: shared memory (iceoryx2) or in-memory |
 //! | `clock` | the time grid, and waiting for it |
+//! | `changes` | the changes of inputs that a run has received while it runs |
 //! | `shared` | words of memory shared between processes |
 //! | `panics` | the message and place of a panic, and the crate it is in |
 //! | `files` | files on a machine with other users: private directories, safe creation |

@@ -1,7 +1,9 @@
 //! The conclusions from a log about the body, and their limits, as sentences.
 
+use super::axes::AxesFit;
 use super::motion::{GROUPS, Motion, Sums};
-use super::{AxesFit, TensorFit, nearest_body};
+use super::nearest_body;
+use super::tensor::TensorFit;
 use nalgebra::Vector3;
 
 /// The number of standard deviations that counts as certain.

@@ -5,7 +5,7 @@
 //! explains only the free ones among the others, because the torques of a hand differ every time. So the body that explains the
 //! most windows is the one that was thrown, and its windows are the free motion. Must not use a given body.
 
-use super::Sample;
+use super::motion::Sample;
 use super::motion::Sums;
 use super::tensor::{Solution, solve};
 use nalgebra::{Matrix3, Vector3};

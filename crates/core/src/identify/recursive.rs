@@ -5,7 +5,7 @@
 //! are then those of the Kalman filter for a constant; only the ratio of noise to initial deviation would matter, and
 //! the initial guess has no weight.
 
-use super::Sample;
+use super::motion::Sample;
 use crate::observe::{
     AxisymmetricError, AxisymmetricRelation, Filter, Identification, InertiaRelation, InvariantFilter, KalmanFilter,
     RateSample,

@@ -5,7 +5,9 @@
 //! |ω_k| is the weight, its sign goes into Δθ, and a body that does not spin counts as not exciting. The relation
 //! must not unwrap an angle, nor use a step in which θ may have rotated by π.
 
-use super::{Identification, Increment, RateSample};
+use super::filter::Increment;
+use super::hidden_rate::RateSample;
+use super::inertia::Identification;
 use crate::vector::zeros;
 use nalgebra::{Vector1, Vector3};
 

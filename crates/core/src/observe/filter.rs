@@ -4,7 +4,7 @@
 //! has the error equation (w − ŵ)' = λ ρ (w − ŵ): \[D\](6)-(10), \[SZ\](4)-(8), \[S\](12)-(16). The papers' auxiliary
 //! variables are eliminated, so that ŵ itself is the state and only *increments* of φ are needed.
 
-use super::Hurwitz;
+use super::hurwitz::Hurwitz;
 use crate::state::{Persist, Words};
 use crate::vector::zeros;
 use nalgebra::SVector;

@@ -9,7 +9,8 @@
 //!
 //! The estimate of the whole state must not enter the guard's filter: the guard converges on its own.
 
-use super::{HiddenRate, HiddenRateError, KalmanFilter, Observation, RateSample};
+use super::hidden_rate::{HiddenRate, HiddenRateError, Observation, RateSample};
+use super::second_order::KalmanFilter;
 use crate::model::{euler, rk4_step};
 use crate::state::{Persist, WeightWords, Words};
 use nalgebra::{Matrix3, Vector1, Vector3};

@@ -5,7 +5,8 @@
 //! increment of φ between two samples is computed. The relation must not choose a branch, unwrap an angle, or divide
 //! by a value that may vanish without a check.
 
-use super::{Increment, Span, StepAgain, series};
+use super::filter::{Increment, Span, StepAgain};
+use super::series;
 use crate::state::{Persist, Words, persist_fields};
 use nalgebra::{Vector1, Vector2, Vector3};
 

@@ -10,7 +10,8 @@
 //!
 //! A torque-free motion, or torque over inertia, determines only the ratios of the moments of inertia.
 
-use super::{Increment, RateSample};
+use super::filter::Increment;
+use super::hidden_rate::RateSample;
 use crate::model::closure;
 use crate::vector::{product, zeros};
 use nalgebra::Vector3;

@@ -5,7 +5,7 @@
 //! drift is the acceleration γ(r, θ, U) of \[S\](10). The printed (9) has L1 for L2 in Γ22; the auxiliary variables z
 //! of (12)-(16) are eliminated here, so that neither appears. The relation must not see a measured velocity.
 
-use super::Increment;
+use super::filter::Increment;
 use crate::state::persist_fields;
 use nalgebra::Vector2;
 

@@ -2,7 +2,8 @@
 //!
 //! It must not compute anything itself: each filter implements its own mathematics.
 
-use super::{Increment, InvariantFilter, KalmanFilter, SecondOrderFilter};
+use super::filter::{Increment, InvariantFilter};
+use super::second_order::{KalmanFilter, SecondOrderFilter};
 use crate::state::{Persist, Words};
 use nalgebra::SVector;
 

@@ -8,7 +8,8 @@
 //! Components are decoupled: each has a scalar filter. φ itself must not be stored, because only its increments are
 //! known: the state is the residual r = φ − φ̂.
 
-use super::{Increment, StepAgain, series};
+use super::filter::{Increment, StepAgain};
+use super::series;
 use crate::state::{Persist, WeightWords, Words, persist_fields};
 use crate::vector::zeros;
 use nalgebra::SVector;

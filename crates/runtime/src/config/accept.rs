@@ -3,7 +3,7 @@
 //! Must not judge; `launch` compares the results of a run with it.
 
 use super::checks::Checks;
-use super::nearest;
+use super::error::nearest;
 use super::raw::{Accept as Raw, RawTicks};
 use super::reader::keys_of;
 use serde::Deserialize;

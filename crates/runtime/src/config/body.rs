@@ -1,6 +1,7 @@
 //! The bodies of a scenario and their roles.
 
-use super::{Checks, nearest};
+use super::checks::Checks;
+use super::error::nearest;
 use std::borrow::Cow;
 
 /// One body of a rig, or a fleet of them.

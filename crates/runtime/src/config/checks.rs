@@ -1,6 +1,7 @@
 //! Findings about a scenario, collected so that all of them are reported at once.
 
-use super::{ConfigError, Document, Problem};
+use super::document::Document;
+use super::error::{ConfigError, Problem};
 use std::cell::RefCell;
 use std::path::PathBuf;
 

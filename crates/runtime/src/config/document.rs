@@ -2,9 +2,11 @@
 //!
 //! Must not know what any key means.
 
+use super::error::{ConfigError, PathError, Place, Problem};
 use super::error::{MISSING_KEY, UNKNOWN_KEY, most_similar, nearest};
 use super::reader::{Refusal, read};
-use super::{ConfigError, PathError, Place, Problem, RunId, Shape};
+use super::run_id::RunId;
+use super::shape::Shape;
 use serde::de::DeserializeOwned;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;

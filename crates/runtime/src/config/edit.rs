@@ -2,7 +2,8 @@
 //!
 //! Must not know what any key means.
 
-use super::{ConfigError, Document, Place};
+use super::document::Document;
+use super::error::{ConfigError, Place};
 use std::collections::BTreeMap;
 use toml::{Table, Value};
 

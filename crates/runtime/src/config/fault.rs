@@ -9,7 +9,7 @@ pub(crate) use raw::RawFault;
 
 use super::body::{BodyInfo, role_names};
 use super::checks::Checks;
-use super::nearest;
+use super::error::nearest;
 use crate::bus::{Port, Signal};
 use crate::fault::{self, Action, Change, ContentFault, Fault, Interruption, Transport, WordRange};
 use crate::sample::FieldKind;

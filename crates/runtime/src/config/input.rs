@@ -3,7 +3,7 @@
 //! Must refuse a change that has no effect. The values themselves are checked by resolving the scenario with each of them.
 
 use super::checks::Checks;
-use super::nearest;
+use super::error::nearest;
 use crate::changes::{ReceivedChanges, SCRIPTED_MAX};
 use crate::fault;
 use crate::input::{COMPONENTS_MAX, Change, Course, Shape, Values};

@@ -3,8 +3,10 @@
 //!
 //! The tables `controller` and `observer` also hold the keys of a rig. This file must not know these.
 
+use super::checks::Checks;
+use super::document::Document;
+use super::error::ConfigError;
 use super::sensor::{EVERY_MAX, common_multiple};
-use super::{Checks, ConfigError, Document};
 use serde::Deserialize;
 use toml::Table;
 

@@ -3,10 +3,10 @@
 //! Each field is an input of the loop. This file must not know what a field means.
 
 use super::checks::Checks;
+use super::error::nearest;
 use super::input::{
     InputInfo, InputUser, RawInput, RawValue, ResponseField, Setting, ShapeName, Variability, change_of,
 };
-use super::nearest;
 use crate::bus::{Port, Signal};
 use crate::config::BodyInfo;
 use crate::input::{Change, Shape, Values};

@@ -1,6 +1,8 @@
 //! Sensors that are slower than the tick: the list `sensor` of a scenario.
 
-use super::{BodyInfo, Checks, nearest};
+use super::body::BodyInfo;
+use super::checks::Checks;
+use super::error::nearest;
 use crate::bus::{Port, Signal};
 use crate::sample::Stamp;
 use crate::sample::status::HELD_FIELDS;

@@ -3,7 +3,7 @@
 //! Must refuse a bound on a quantity that a rig does not provide: it would never be breached.
 
 use super::checks::Checks;
-use super::nearest;
+use super::error::nearest;
 use super::raw::{OnBreach, Watchdog};
 use crate::control::WatchBounds;
 use std::collections::BTreeMap;

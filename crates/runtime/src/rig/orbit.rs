@@ -14,11 +14,11 @@ pub use design::OrbitRig;
 pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
 pub use roles::{OrbitLaw, OrbitObserver, OrbitPlant};
 
+use super::BodyInfo;
 use super::contract::pair;
-use super::{
-    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FleetTruth, Graph, Inputs, Monitor, NoFleet,
-    Picture, Plane, Rig, Start, Watched,
-};
+use super::contract::{CertificateReport, ConditionReport, Context, Figure, FleetTruth, Monitor, Rig, Start, Watched};
+use super::fleet::NoFleet;
+use super::pictures::{Graph, Inputs, Picture, Plane};
 use crate::bus::Signal;
 use crate::config::{Checks, ConfigError, Document, InputInfo};
 use crate::control::{Condition, OrbitCertificate, OrbitHold};

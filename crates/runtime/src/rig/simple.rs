@@ -2,9 +2,10 @@
 //!
 //! This file does nothing that a [`Rig`] implementation could not do.
 
-use super::{
-    BodyInfo, Command, Context, Estimate, FleetTruth, Measurement, Monitor, NoFleet, Picture, Rig, Truth, graphs,
-};
+use super::BodyInfo;
+use super::contract::{Command, Context, Estimate, FleetTruth, Measurement, Monitor, Rig, Truth};
+use super::fleet::NoFleet;
+use super::pictures::{Picture, graphs};
 use crate::config::{Checks, ConfigError, Document, InputInfo, keys_of};
 use crate::input::COMPONENTS_MAX;
 use crate::role::{Body, Estimator, Guard, Law, REFERENCE_MAX, Refusal, SingleBody};

@@ -2,7 +2,7 @@
 //!
 //! A sample of another length than the rig's own is never interpreted.
 
-use super::{Command, Estimate, FleetCommand, FleetMeasurement, FleetTruth, Measurement, Rig, Truth};
+use super::contract::{Command, Estimate, FleetCommand, FleetMeasurement, FleetTruth, Measurement, Rig, Truth};
 use crate::bus::{Carried, Port, Signal, Topic};
 use crate::config::BodyInfo;
 use crate::role::Guard;

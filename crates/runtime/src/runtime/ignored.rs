@@ -1,6 +1,6 @@
 //! Changes of inputs that a role ignores because a program runs it that takes no inputs. Must not know how a program shows that.
 
-use super::RoleId;
+use super::role_id::RoleId;
 use crate::config::{InputInfo, Settings};
 
 /// Returns the reason why an input cannot change: a role that uses it, for which `ignores` returns true. `None` if every role takes it.

@@ -19,12 +19,11 @@ pub use fleet::RateFleet;
 pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
 pub use plant::RatePlant;
 
+use super::BodyInfo;
 use super::contract::pair;
+use super::contract::{CertificateReport, ConditionReport, Context, Figure, Monitor, Rig, Start, Watched};
 use super::filter::{FilterDesign, UNKNOWN_DEVIATION};
-use super::{
-    BodyInfo, CertificateReport, ConditionReport, Context, Figure, Graph, Inputs, Lyapunov, Monitor, Picture, Plane,
-    Rig, Start, Watched,
-};
+use super::pictures::{Graph, Inputs, Lyapunov, Picture, Plane};
 use crate::bus::Signal;
 use crate::config::{Checks, ConfigError, Document, InputInfo};
 use crate::control::{Certificate, Synchronizer};
