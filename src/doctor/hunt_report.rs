@@ -2,7 +2,7 @@
 
 use super::probe::Wakes;
 use crate::late::{ASCII_US, LateReport, LateTick, SCHEMA as LATE_SCHEMA, Source, TracerCost};
-use crate::late::{header, late_table, pattern, us};
+use crate::late::{folded, header, late_table, pattern, us};
 use crate::telemetry::{Grant, MachineInfo, Percentiles};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -166,7 +166,7 @@ impl fmt::Display for HuntReport {
             writeln!(f, "{}", late_table(&self.late, CAUSE_LINES))?;
             self.late.patterns.iter().try_for_each(|found| writeln!(f, "{}", pattern(found)))?;
         }
-        writeln!(f, "{}", header(&self.late, ASCII_US))?;
+        writeln!(f, "{}", folded(&header(&self.late, ASCII_US)))?;
         self.late.note.iter().try_for_each(|note| writeln!(f, "note: {note}"))
     }
 }

@@ -43,7 +43,7 @@ pub use ring::{TraceRing, remove_dead_traces};
 pub use steal::Steal;
 pub use tracer::run_tracer;
 pub use words::late_table;
-pub(crate) use words::{ASCII_US, cause_rows, header, listing, pattern, sentence, us};
+pub(crate) use words::{ASCII_US, cause_rows, folded, header, listing, pattern, sentence, us};
 
 #[cfg(test)]
 pub(crate) mod fixture;

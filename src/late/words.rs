@@ -71,11 +71,23 @@ pub fn header(report: &LateReport, unit: &str) -> String {
     let number = if counted == examined { counted.to_string() } else { format!("{examined} of {counted}") };
     let part = match report.left_out() {
         0 => String::new(),
-        left_out => format!(" ({left_out} short ones left out of this file)"),
+        left_out => format!("; {left_out} short ones left out of this file"),
     };
     let steal = |(core, ms): (&usize, &f64)| format!("; the hypervisor took {} ms of core {core}", plain(*ms));
     let steal: String = report.steal_ms.iter().map(steal).collect();
     format!("{number} late ticks examined{part}; limit {} {unit}; causes from {source}{steal}", plain(report.late_us))
+}
+
+/// Breaks a line between its parts, which end with `; `, into lines of at most 80 columns if no part is longer.
+pub fn folded(line: &str) -> String {
+    let mut lines: Vec<String> = Vec::new();
+    for part in line.split("; ") {
+        match lines.last_mut() {
+            Some(line) if line.chars().count() + part.chars().count() + 3 <= COLUMNS => line.extend(["; ", part]),
+            _ => lines.push(part.to_owned()),
+        }
+    }
+    lines.join(";\n")
 }
 
 /// Returns late ticks with their chains of causes, one cause per line.
@@ -250,5 +262,11 @@ mod tests {
         let text = listing(&report, &report.worst_first(), "us");
         assert!(text.lines().all(|line| line.len() < 120), "{text}");
         assert!(header(&report, "us").len() < 120);
+        report.traced = Some(7);
+        report.steal_ms = [(0, 20.0), (1, 70.0)].into();
+        let line = header(&report, "us");
+        let text = folded(&line);
+        assert!(text.lines().count() > 2 && text.lines().all(|line| line.chars().count() <= COLUMNS), "{text}");
+        assert_eq!(text.replace('\n', " "), line);
     }
 }

@@ -3,7 +3,7 @@
 use super::output::{CommandResult, Exit, Failure, fail, harmless, remark, say};
 use super::{perfetto, record, runs};
 use crate::files;
-use crate::late::{ASCII_US, LateReport, LateTick, TickOfRole, header, listing, pattern};
+use crate::late::{ASCII_US, LateReport, LateTick, TickOfRole, folded, header, listing, pattern};
 use crate::launch::{LATE, RECORDING, SUMMARY, Summary};
 use crate::record::{RecordError, Recording};
 use std::collections::BTreeSet;
@@ -205,7 +205,7 @@ impl Run {
 /// Returns the selected late ticks as text. A tick in the chain of an earlier one is not listed again.
 fn text(late: &LateReport, arguments: &Arguments, selected: &[&LateTick]) -> String {
     let (shown, left) = late.heads(selected, arguments.count.get());
-    let mut text = format!("{}: {}\n", late.scenario, header(late, ASCII_US));
+    let mut text = folded(&format!("{}: {}", late.scenario, header(late, ASCII_US))) + "\n";
     // Writing to a string does not fail.
     if let Some(note) = &late.note {
         let _ = writeln!(text, "note: {note}");

@@ -11,7 +11,7 @@
 //! | `script` | reconstructs the ticks that a role executed, and their inputs |
 //! | `replay` | feeds recorded inputs to the live roles, and compares their outputs bit for bit |
 //! | `diff` | compares two recordings |
-//! | `error` | the errors |
+//! | `error` | the errors of recordings |
 //! | `export` | writes tables as CSV and, with the feature of that name, Parquet |
 //!
 //! Must not change a sample, nor delay a loop, except by its credit in lockstep.

@@ -144,6 +144,11 @@ fn hunt(bench: &Bench, options: &[&str], rate_hz: u64) -> Value {
     let counted: u64 = cores.iter().map(|core| number(&core["late"])).sum();
     assert_eq!((late["schema"].as_str(), number(&late["counted"])), (Some("corotate/late/v1"), counted));
     assert!(number(&late["examined"]) <= counted, "{late}");
+    // Only the trace knows a task's thread.
+    let has_thread = |tick: &&Value| tick["causes"].as_array().unwrap().iter().any(|cause| cause.get("tid").is_some());
+    let named = late["ticks"].as_array().unwrap().iter().filter(has_thread).map(|tick| number(&tick["ticks"])).sum();
+    let most = if late["source"] == "kernel" { number(&late["examined"]) } else { 0 };
+    assert!((named..=most).contains(&number(&late["traced"])), "{late}");
     let explained = |tick: &Value| {
         let causes = tick["causes"].as_array().unwrap().iter();
         causes.map(|cause| cause["us"].as_f64().unwrap()).sum::<f64>() <= tick["late_us"].as_f64().unwrap() + 1e-6

@@ -34,7 +34,7 @@ fn late_report(run: &Value) -> Value {
     ]);
     json!({
         "schema": "corotate/late/v1", "run": run, "scenario": "rigid-pair", "period_us": 1000.0, "late_us": 100.0,
-        "source": "kernel", "counted": 5, "examined": 5,
+        "source": "kernel", "counted": 5, "examined": 5, "traced": 2,
         "ticks": [late("follower", 300, 3, "missed", 2900.0, json!([])), leader, controller],
         "causes": [
             { "cause": "late input from leader", "kind": "input", "name": "leader", "ticks": 1, "worst_us": 900.0, "sum_us": 900.0 },
@@ -75,6 +75,7 @@ fn late_ticks_are_selected_by_tick_role_and_number() {
     assert!(printed(&bench, &["--tick", "303"]).is_empty() && printed(&bench, &["--role", "observer"]).is_empty());
 
     let object = why(&bench, &["--json", "--tick", "755"]).json();
+    assert_eq!(object["traced"], 2);
     assert_eq!((&object["counted"], &object["examined"], &object["selected"]), (&json!(5), &json!(5), &json!(2)));
     assert_eq!(object["ticks"][0]["chain"], json!([{ "role": "leader", "tick": 755 }]));
     assert_eq!(object["ticks"][1]["unknown_us"], 10.0);
