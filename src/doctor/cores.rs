@@ -1,6 +1,6 @@
 //! Checks of the cores that the roles may use: how many, how many of them are left to the roles, and what disturbs them.
 
-use super::Check;
+use super::check::Check;
 use super::machine::{Demand, Machine};
 use crate::runtime::{CpuQuota, CpuSetLimit, cpu_quota, cpu_set};
 

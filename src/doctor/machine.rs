@@ -2,7 +2,7 @@
 //!
 //! All files lie below a root, so that a test can simulate a machine. Must not write; it only opens files that must be writable.
 
-use super::Check;
+use super::check::Check;
 use crate::config::{Cores, Realtime};
 use crate::runtime::{RoleId, shared_memory_bytes};
 use crate::scenario::Scenario;

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `machine` | reads /proc, /sys and /dev below a root, and judges each value |
 //! | `cores` | the same for the cores of the roles |
+//! | `check` | one line of the report |
 //! | `trial` | judges the roles' reports of a few seconds in real time |
 //! | `hunt` | measures the lateness of wakes on each core, and finds the causes of late ones |
 //! | `probe` | the thread on a core that wakes |
@@ -12,6 +13,7 @@
 //! Must not change the machine, apart from the trace instance of a hunt, nor start the run, and must not fail: a value that the
 //! system does not provide is unknown.
 
+mod check;
 mod cores;
 mod hunt;
 mod hunt_report;
@@ -19,6 +21,7 @@ mod machine;
 mod probe;
 mod trial;
 
+pub use check::{Check, Verdict};
 pub use hunt::hunt;
 pub use hunt_report::{CoreLateness, HuntOptions, HuntReport};
 pub use machine::{Demand, Machine};
@@ -36,56 +39,6 @@ use std::path::Path;
 const SCHEMA: &str = "corotate/doctor/v1";
 /// The width of the column of names.
 const NAME_WIDTH: usize = 20;
-
-/// The verdict of one line of the report.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Verdict {
-    /// No change is needed.
-    Ok,
-    /// It works, but can be improved or is unknown.
-    Warn,
-    /// It causes missed deadlines.
-    Bad,
-}
-
-impl Verdict {
-    /// Returns the word in the report.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Ok => "ok",
-            Self::Warn => "warn",
-            Self::Bad => "bad",
-        }
-    }
-}
-
-/// One line of the report.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Check {
-    /// The name of the checked item.
-    pub name: &'static str,
-    /// The value that was found.
-    pub found: String,
-    /// The verdict on it.
-    pub verdict: Verdict,
-    /// The remedy; `None` if the verdict is ok.
-    pub remedy: Option<String>,
-}
-
-impl Check {
-    fn ok(name: &'static str, found: impl Into<String>) -> Self {
-        Self { name, found: found.into(), verdict: Verdict::Ok, remedy: None }
-    }
-
-    fn warn(name: &'static str, found: impl Into<String>, remedy: impl Into<String>) -> Self {
-        Self { name, found: found.into(), verdict: Verdict::Warn, remedy: Some(remedy.into()) }
-    }
-
-    fn bad(name: &'static str, found: impl Into<String>, remedy: impl Into<String>) -> Self {
-        Self { name, found: found.into(), verdict: Verdict::Bad, remedy: Some(remedy.into()) }
-    }
-}
 
 /// The whole report.
 #[derive(Debug, Clone, Serialize)]

@@ -2,7 +2,7 @@
 //!
 //! Must not start the run, and must judge only what ran.
 
-use super::Check;
+use super::check::Check;
 use crate::telemetry::{Grant, Latency, Percentiles, RoleReport, Ticks};
 use serde::Serialize;
 use std::collections::BTreeMap;

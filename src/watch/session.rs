@@ -2,7 +2,7 @@
 //!
 //! Must not stay in the domain after the run has ended, since its owner removes the domain.
 
-use super::WatchError;
+use super::error::WatchError;
 use super::feed::{Feed, POLL_NS};
 use super::model::Model;
 use super::tune::Tune;

@@ -2,7 +2,7 @@
 //!
 //! ratatui's hook restores it after a panic. A signal handler only sets a number, which the loop here reads.
 
-use super::WatchError;
+use super::error::WatchError;
 use super::feed::POLL_NS;
 use super::input::{Action, action};
 use super::model::Model;

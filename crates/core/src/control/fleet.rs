@@ -5,7 +5,7 @@
 //! the same order, none of them fused, and no sum over followers. The law must not allocate, nor store anything about
 //! a follower.
 
-use super::{Synchronizer, limited};
+use super::synchronizer::{Synchronizer, limited};
 use crate::model::flow_all;
 use nalgebra::Vector3;
 

@@ -2,7 +2,8 @@
 //!
 //! The certificate only reports; its reader decides which failed condition is an error.
 
-use super::{Condition, OrbitGains, OrbitHold};
+use super::certificate::Condition;
+use super::orbit_hold::{OrbitGains, OrbitHold};
 use crate::model::{CentralField, OrbitFault, OrbitState};
 use nalgebra::{SVector, Vector2};
 

@@ -13,7 +13,7 @@
 //!
 //! The law must not command more than the thrusters' limit, nor a value that is not finite.
 
-use super::Condition;
+use super::certificate::Condition;
 use crate::model::{CentralField, OrbitState};
 use crate::vector::zeros;
 use nalgebra::Vector2;

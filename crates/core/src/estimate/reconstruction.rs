@@ -1,6 +1,6 @@
 //! The hidden component, sample by sample: segments, initial guesses and damping around the relation and its filters.
 
-use super::Wheel;
+use super::wheel::Wheel;
 use crate::identify::{Sample, undamped};
 use crate::observe::{
     Filter, HiddenRate, HiddenRateError, Increment, Interval, InvariantFilter, KalmanFilter, Observation, RateSample,

@@ -1,7 +1,7 @@
 //! The comparison of the estimate with a measured component: root mean squares over the part of each segment in which
 //! the initial guess has decayed. Memory is bounded. A segment's score must not be read before it has ended.
 
-use super::Reconstructed;
+use super::reconstruction::Reconstructed;
 
 /// The longest segment, in samples, that is scored over its second half. Longer ones are scored over all but the
 /// first half of this number.

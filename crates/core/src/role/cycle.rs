@@ -3,7 +3,9 @@
 //!
 //! It gives the bits of an undisturbed run. It must not judge a sample, nor repeat the computation of a role.
 
-use super::{CommandEvent, Controller, Estimator, Law, Observer, Plant, SingleBody};
+use super::controller::{Controller, Law};
+use super::observer::{Estimator, Observer};
+use super::plant::{CommandEvent, Plant, SingleBody};
 use crate::sample::{Message, Stamp};
 
 /// A body with its newest samples, its controller if it is driven, and its observer unless it is the first body.

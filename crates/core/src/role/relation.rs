@@ -2,7 +2,7 @@
 //!
 //! It must not depend on the meaning of the measured quantities.
 
-use super::Estimator;
+use super::observer::Estimator;
 use crate::observe::{Increment, InvariantFilter};
 use crate::sample::{Sample, status};
 use crate::state::{Persist, Words};

@@ -2,7 +2,9 @@
 //!
 //! The layout is derived at compile time from those of the two samples. This module must not know when a command acts.
 
-use super::{Field, FieldKind, Message, Sample, Stamp};
+use super::field::{Field, FieldKind};
+use super::message::{Message, Sample};
+use super::stamp::Stamp;
 use crate::state::{Persist, Words};
 use bytemuck::{Pod, Zeroable};
 use core::ops::Deref;

@@ -3,7 +3,8 @@
 //! The bytes of a sample are the body of that message in little-endian CDR: every field is naturally aligned, so no
 //! conversion is needed. This module must not depend on files.
 
-use super::{Field, FieldKind, Stamp};
+use super::field::{Field, FieldKind};
+use super::stamp::Stamp;
 use std::fmt::Write;
 
 /// The MCAP name of the encoding of definitions.

@@ -5,7 +5,10 @@
 //! component 2 of every body, component 3 of every body. Every element is a word of 8 bytes, so the bytes equal those
 //! of a message with arrays of that fixed length.
 
-use super::{Field, FieldKind, LayoutName, Message, Stamp};
+use super::field::{Field, FieldKind};
+use super::layout::LayoutName;
+use super::message::Message;
+use super::stamp::Stamp;
 use bytemuck::TransparentWrapper;
 use core::fmt;
 use core::marker::PhantomData;

@@ -3,7 +3,8 @@
 //! A layout that changes without a new version in its type name has another hash, so that programs built from
 //! different sources cannot connect. The hash is computed at compile time. It must not depend on the transport.
 
-use super::{Field, FieldKind, Stamp};
+use super::field::{Field, FieldKind};
+use super::stamp::Stamp;
 
 /// The maximum length of a type name, bytes.
 const TYPE_NAME_MAX: usize = 200;

@@ -1,7 +1,7 @@
 //! Samples of the rigs `orbit-hold` and `orbit-rendezvous`, in polar coordinates about the central body, \[S\](1). du
 //! is the unit of length of the scenario's gravitational parameter.
 
-use super::sample;
+use crate::sample;
 
 sample! {
     /// The true state of a body. For recording and scoring only: no observer and no controller opens it.

@@ -1,6 +1,6 @@
 //! The order of one signal's samples: decides which sample counts for a tick.
 
-use super::{NO_SAMPLE, Stamp};
+use super::stamp::{NO_SAMPLE, Stamp};
 
 /// The place of a sample in the order of its signal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

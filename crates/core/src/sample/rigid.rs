@@ -1,6 +1,6 @@
 //! Samples of the rig `rigid-body`. Axes are the body's principal axes; arrays are indexed by axis.
 
-use super::sample;
+use crate::sample;
 
 sample! {
     /// The true state of a body. For recording and scoring only: no observer and no controller opens it.

@@ -1,6 +1,6 @@
 //! Samples that coordinate the phases of a run between the launcher and the roles. The same for every rig.
 
-use super::sample;
+use crate::sample;
 
 sample! {
     /// The phase of the run, published by the launcher to all roles. The stamp's tick counts the announcements.

@@ -5,9 +5,10 @@
 //! received bytes.
 
 use super::frame::{Decoder, FrameCounters, MAX_FRAME, MAX_PAYLOAD, encode};
-use super::message::{Answer, Hello, Message, ParseError, Reason, Refuse, Tick, Welcome, parse, shorten, write};
+use super::message::{
+    Answer, Hello, MAX_CONTENT, MAX_SAMPLES, Message, ParseError, Reason, Refuse, Tick, Welcome, parse, shorten, write,
+};
 use super::role::{DeviceRole, Inputs, Layout, Outputs, length};
-use super::{MAX_CONTENT, MAX_SAMPLES};
 use crate::role::CommandEvent;
 
 /// A device behind a byte stream, with the role that `make` creates for a run.

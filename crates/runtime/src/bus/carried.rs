@@ -3,7 +3,9 @@
 //!
 //! Generic code serves both kinds without cost for the simpler one. Must not know how a bus carries samples.
 
-use super::{Bus, BusError, Read, Reader, Topic, Write};
+use super::error::BusError;
+use super::link::{Bus, Read, Reader, Write};
+use super::names::Topic;
 use crate::sample::{Field, FleetLayout, FleetSample, Message, Sample};
 use std::borrow::{Borrow, BorrowMut};
 use std::marker::PhantomData;

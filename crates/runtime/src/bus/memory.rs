@@ -1,6 +1,9 @@
 //! The bus within one thread: the semantics of [`super::iox`] without shared memory or files.
 
-use super::{Bus, BusError, Depths, FleetBuffer, Read, Reader, Topic, Write};
+use super::carried::FleetBuffer;
+use super::error::BusError;
+use super::link::{Bus, Depths, Read, Reader, Write};
+use super::names::Topic;
 use crate::sample::{FleetLayout, FleetSample, Sample};
 use std::any::Any;
 use std::cell::RefCell;

@@ -3,8 +3,8 @@
 //! A notifier is a futex in the shared memory of a run. It has no owner, so no death can lock it. A writer makes no
 //! system call if no reader sleeps. Must not carry data: a woken reader polls its link.
 
-use super::Topic;
 use super::domain::Domain;
+use super::names::Topic;
 use crate::clock::monotonic_ns;
 use crate::shared::SharedHalves;
 use rustix::thread::futex;

@@ -1,7 +1,11 @@
 //! A signal as data: its topic, the layout of its samples, and functions that open its ends without knowing their type.
 
+use super::carried::Carried;
+use super::error::BusError;
 use super::iox::Qos;
-use super::{AnyBus, BusError, Carried, Depths, EndOpeners, Reader, Topic, WordReader, WordWriter};
+use super::link::{Depths, Reader};
+use super::names::Topic;
+use super::words::{AnyBus, EndOpeners, WordReader, WordWriter};
 use crate::sample::Field;
 
 /// A signal with the layout of its samples.

@@ -3,8 +3,9 @@
 //! Like `iox.rs` it may know iceoryx2. Must be neither better nor worse than plain use of the library.
 
 use super::domain::Domain;
+use super::error::BusError;
+use super::iox::Ipc;
 use super::iox::enter;
-use super::{BusError, iox::Ipc};
 use crate::files::Directory;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;

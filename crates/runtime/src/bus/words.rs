@@ -3,9 +3,12 @@
 //!
 //! Must not know the meaning of samples. Roles use typed ends instead, which need no dynamic dispatch.
 
+use super::carried::Carried;
+use super::error::BusError;
 use super::iox::IoxBus;
+use super::link::{Read, Reader, Write, WriterProcess};
 use super::memory::MemoryBus;
-use super::{BusError, Carried, Read, Reader, Topic, Write, WriterProcess};
+use super::names::Topic;
 use std::marker::PhantomData;
 
 /// A bus of either kind.

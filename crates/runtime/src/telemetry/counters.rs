@@ -2,8 +2,10 @@
 //!
 //! Nodes and links decide which counter an event belongs to; this module only adds.
 
+use super::hash::StateHash;
+use super::late::{LateRecord, LateTicks};
 use super::ledger::Ledger;
-use super::{Excused, LateRecord, LateTicks, LinkRead, LinkWritten, StateHash, Ticks, WatchReport, WatchedReport};
+use super::report::{Excused, LinkRead, LinkWritten, Ticks, WatchReport, WatchedReport};
 use crate::control::{Breaches, Watchdog};
 use crate::role::Refusal;
 use crate::state::persist_fields;

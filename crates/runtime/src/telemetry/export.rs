@@ -1,6 +1,6 @@
 //! Histograms as files that other tools read: percentile tables (`.hgrm`) and interval logs (`.hlog`).
 
-use super::Latency;
+use super::latency::Latency;
 use hdrhistogram::serialization::V2DeflateSerializer;
 use hdrhistogram::serialization::interval_log::{IntervalLogWriterBuilder, Tag};
 use std::io::{self, Write};

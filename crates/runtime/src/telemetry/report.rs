@@ -1,6 +1,8 @@
 //! The final report of a role: counters, hash, histograms, privileges.
 
-use super::{Checkpoints, LateRecord, Latency, Tallies};
+use super::hash::Checkpoints;
+use super::late::LateRecord;
+use super::latency::{Latency, Tallies};
 use crate::serial::LineCounters;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
