@@ -34,7 +34,7 @@ pub struct LogArguments {
     #[arg(long, value_name = "NAME")]
     by: Option<String>,
     /// Begin a segment after a longer pause, s [default: 5 usual intervals]
-    #[arg(long, value_name = "S", allow_negative_numbers = true, hide_short_help = true)]
+    #[arg(long, value_name = "S", hide_short_help = true)]
     gap: Option<f64>,
     /// Read from this time on, s since the first row
     #[arg(long, value_name = "S", conflicts_with_all = ["segments", "find_free"], hide_short_help = true)]

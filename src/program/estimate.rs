@@ -47,7 +47,7 @@ pub struct Arguments {
     #[arg(long, value_name = "X,Y,Z", value_parser = three)]
     inertia: Option<Vector3<f64>>,
     /// Air damping c of the torque -c I w, 1/s [default: the body's, else 0]
-    #[arg(long, value_name = "C", allow_negative_numbers = true, hide_short_help = true)]
+    #[arg(long, value_name = "C", hide_short_help = true)]
     damping: Option<f64>,
     /// Momentum of a wheel about the sensor's axes, N m s, for an inertia in kg m2 [default: the body's, else 0]
     #[arg(long, value_name = "X,Y,Z", value_parser = three, allow_hyphen_values = true, hide_short_help = true,
@@ -60,16 +60,16 @@ pub struct Arguments {
     #[arg(long, value_enum, default_value_t = Order::First, hide_short_help = true)]
     filter: Order,
     /// Decay rate of the estimate's errors, 1/s [default: chosen from noise and motion]
-    #[arg(long, value_name = "RATE", allow_negative_numbers = true)]
+    #[arg(long, value_name = "RATE")]
     decay: Option<f64>,
     /// Standard deviation of a measured rate for the Kalman filter, rad/s [default: estimated from the log]
-    #[arg(long, value_name = "RAD/S", allow_negative_numbers = true, hide_short_help = true)]
+    #[arg(long, value_name = "RAD/S", hide_short_help = true)]
     noise: Option<f64>,
     /// First estimate of every segment, rad/s [default: from the first step]
-    #[arg(long, value_name = "RAD/S", allow_negative_numbers = true, hide_short_help = true)]
+    #[arg(long, value_name = "RAD/S", hide_short_help = true)]
     guess: Option<f64>,
     /// Measured rates below this do not determine the hidden one, rad/s [default: 10 times their noise]
-    #[arg(long, value_name = "RAD/S", allow_negative_numbers = true, hide_short_help = true)]
+    #[arg(long, value_name = "RAD/S", hide_short_help = true)]
     floor: Option<f64>,
     /// Write every row with its estimate: Parquet if the name ends in .parquet, else CSV
     #[arg(long, value_name = "FILE")]

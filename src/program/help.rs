@@ -55,13 +55,22 @@ Example:
 
 /// Returns the definition of the command line, complete with version and help.
 pub fn line(definition: clap::Command) -> clap::Command {
-    let line = named(definition);
+    let line = with_negative_numbers(named(definition));
     let short = format!("{} ({})", version(), env!("COROTATE_BUILT_REVISION"));
     let long = format!("{short}\n{}", about_build());
     let overview = overview(&line) + OPTIONS;
     // Leaked once: the process parses one command line.
     let line = line.version(&*short.leak()).long_version(&*long.leak());
     line.help_template(TEMPLATE).after_help(overview).color(asked_color())
+}
+
+/// Accepts a negative number as any value: its parser gives the range, if it is out of range.
+fn with_negative_numbers(definition: clap::Command) -> clap::Command {
+    let accept = |argument: clap::Arg| {
+        let takes_values = argument.get_action().takes_values();
+        argument.allow_negative_numbers(takes_values)
+    };
+    definition.mut_args(accept).mut_subcommands(with_negative_numbers)
 }
 
 /// Returns the definition with the program's name and version, equal on every machine.
@@ -191,7 +200,22 @@ fn verbatim(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::Arguments;
     use super::*;
+    use clap::CommandFactory;
+    use clap::error::ErrorKind;
+
+    #[test]
+    fn a_negative_number_is_refused_by_the_parser_of_its_option() {
+        for words in [
+            ["corotate", "why", "--tick", "-3"],
+            ["corotate", "watch", "--once", "-1"],
+            ["corotate", "set", "--ramp", "-2"],
+        ] {
+            let refused = line(Arguments::command()).try_get_matches_from(words).unwrap_err();
+            assert_eq!(refused.kind(), ErrorKind::ValueValidation, "{words:?}");
+        }
+    }
 
     #[test]
     fn formatter_commands_are_escaped() {

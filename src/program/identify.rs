@@ -34,7 +34,7 @@ pub struct Arguments {
     #[arg(long)]
     no_damping: bool,
     /// Decay rate of the recursive filter, s2/rad3, or 1/rad with --symmetry-axis [default: 0, no forgetting]
-    #[arg(long, value_name = "RATE", allow_negative_numbers = true, hide_short_help = true)]
+    #[arg(long, value_name = "RATE", hide_short_help = true)]
     decay: Option<f64>,
     /// Print one line of JSON (corotate/identify/v1)
     #[arg(long)]

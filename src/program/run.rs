@@ -44,10 +44,10 @@ pub struct Arguments {
     #[arg(long, value_name = "CLOCK", value_parser = ["realtime", "lockstep", "in-process"])]
     clock: Option<String>,
     /// Length of the run, s
-    #[arg(long, value_name = "S", allow_negative_numbers = true)]
+    #[arg(long, value_name = "S")]
     duration: Option<String>,
     /// Ticks per second, Hz
-    #[arg(long, value_name = "HZ", allow_negative_numbers = true)]
+    #[arg(long, value_name = "HZ")]
     tick_hz: Option<String>,
     /// Override a key, such as leader.measured_axes=[1,3]
     #[arg(long, value_name = "KEY=VALUE")]

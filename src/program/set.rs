@@ -78,9 +78,13 @@ fn seconds(text: &str) -> Result<f64, String> {
 /// Changes inputs of a running loop.
 pub fn set(arguments: &SetArguments) -> CommandResult {
     let (run, assignments) = split(&arguments.words, |word| word.contains('='));
-    let root = runs::domain(run.map(Path::new))?;
     let changes = assignments.iter().map(|word| wanted(word, arguments.ramp)).collect::<Result<Vec<_>, _>>();
     let changes = changes.map_err(|failure| fail(Exit::Usage, failure))?;
+    if changes.is_empty() && arguments.save.is_none() {
+        let text = "name an input and its value, as in `corotate set controller.gain_per_s=[6,6,6]`";
+        return Err(fail(Exit::Usage, Failure::new("no-change", text)));
+    }
+    let root = runs::domain(run.map(Path::new))?;
     if changes.is_empty() {
         return save(&root, arguments, changes);
     }

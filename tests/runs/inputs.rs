@@ -341,6 +341,8 @@ fn impossible_changes_are_refused_with_their_reason() {
     await_inputs(&domain(&bench));
     assert_eq!(set(&["leader.inertia_kg_m2=[1,2,3]"]), refused("not-tunable"));
     assert_eq!(set(&["controller.gian_per_s=[1,2,3]"]), refused("not-tunable"));
+    assert_eq!(set(&[]), refused("no-change"));
+    assert_eq!(set(&["controller.gain_per_s"]), refused("no-equals"));
     assert_eq!(set(&["controller.gain_per_s=[1,2]"]), refused("wrong-length"));
     assert_eq!(set(&["controller.gain_per_s=[1,2,-3]"]), refused("not-positive"));
     assert_eq!(set(&["controller.gain_per_s=[1,2,nan]"]), refused("not-finite"));

@@ -282,7 +282,7 @@ fn find<'a>(infos: &'a [InputInfo], key: &str) -> Result<(usize, &'a InputInfo),
         let keys: Vec<&str> = infos.iter().map(|info| &*info.key).collect();
         match keys.is_empty() {
             true => "nothing in this scenario can change while it runs".to_owned(),
-            false => format!("cannot change while the loop runs; {}", nearest(&plain, &keys)),
+            false => format!("{plain} cannot change while the loop runs; {}", nearest(&plain, &keys)),
         }
     })
 }
