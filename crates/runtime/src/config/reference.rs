@@ -8,7 +8,7 @@ use super::input::{
     InputInfo, InputUser, RawInput, RawValue, ResponseField, Setting, ShapeName, Variability, change_of,
 };
 use crate::bus::{Port, Signal};
-use crate::config::BodyInfo;
+use crate::config::body::BodyInfo;
 use crate::input::{Change, Shape, Values};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;

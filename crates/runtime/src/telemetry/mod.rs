@@ -2,6 +2,7 @@
 //!
 //! Everything is allocated before the loop starts and only counted in it; export and arithmetic follow. Must not log.
 
+mod atomic;
 mod counters;
 mod export;
 mod handover;
@@ -11,11 +12,6 @@ mod latency;
 mod ledger;
 mod machine;
 mod report;
-
-/// The atomics of [`handover`], which a model checker replaces.
-mod atomic {
-    pub use std::sync::atomic::{AtomicU64, Ordering, fence};
-}
 
 pub use counters::{ReadCounters, TickCounters, WriteCounters};
 pub use export::{write_hgrm, write_hlog};

@@ -3,8 +3,10 @@
 use super::cause;
 use super::opening::{Connections, IoxBus};
 use super::service::{Ipc, buffer_size, has_writer, writer};
+use crate::bus::error::BusError;
+use crate::bus::link::{Read, Reader, Write, WriterProcess};
+use crate::bus::names::Topic;
 use crate::bus::notifier::Notifier;
-use crate::bus::{BusError, Read, Reader, Topic, Write, WriterProcess};
 use crate::sample::{FleetLayout, FleetSample};
 use bytemuck::TransparentWrapper;
 use core::marker::PhantomData;

@@ -6,7 +6,7 @@
 
 use super::opening::OpenFailure;
 use super::service::{Ipc, MAX_NODES, MAX_READERS, Wire};
-use crate::bus::Topic;
+use crate::bus::names::Topic;
 use crate::sample::Sample;
 use iceoryx2::node::Node;
 use iceoryx2::port::reader::{BlackboardValue, EntryHandle};

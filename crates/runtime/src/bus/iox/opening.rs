@@ -5,8 +5,10 @@
 use super::cause;
 use super::service::{Ipc, config};
 use crate::bus::domain::Domain;
+use crate::bus::error::BusError;
+use crate::bus::link::Depths;
+use crate::bus::names::Topic;
 use crate::bus::notifier::Notifiers;
-use crate::bus::{BusError, Depths, Topic};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::sample::type_name_of;
 use iceoryx2::node::Node;

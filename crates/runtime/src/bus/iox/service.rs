@@ -2,8 +2,9 @@
 
 use super::cause;
 use crate::bus::domain::Domain;
+use crate::bus::link::{Depths, Reader, WriterProcess};
+use crate::bus::names::Signal;
 use crate::bus::notifier::NOTIFIERS_BYTES;
-use crate::bus::{Depths, Reader, Signal, WriterProcess};
 use crate::changes::{CHANGES_MAX, SCRIPTED_MAX};
 use crate::sample::Sample;
 use iceoryx2::config::Config;

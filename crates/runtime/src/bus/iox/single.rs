@@ -3,8 +3,10 @@
 use super::cause;
 use super::latest::{LatestReader, LatestWriter};
 use super::service::{Ipc, Wire, has_writer, writer};
+use crate::bus::error::BusError;
+use crate::bus::link::{Read, Write, WriterProcess};
+use crate::bus::names::Topic;
 use crate::bus::notifier::Notifier;
-use crate::bus::{BusError, Read, Topic, Write, WriterProcess};
 use crate::sample::{NO_SAMPLE, Sample};
 use iceoryx2::node::Node;
 use iceoryx2::port::publisher::Publisher;

@@ -5,7 +5,7 @@
 use super::roles::{POSITION, VELOCITY};
 use crate::config::Checks;
 use crate::model::{CentralField, OrbitState};
-use crate::rig::Figure;
+use crate::rig::contract::Figure;
 use crate::rig::filter::SURE_DEVIATIONS;
 use crate::role::{Bounds, Guard, PlausibilityCheck, Refusal};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, Sample, status};

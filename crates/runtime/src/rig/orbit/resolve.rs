@@ -8,7 +8,7 @@ use super::roles::Aim;
 use crate::config::{BodyInfo, Checks, ConfigError, Document};
 use crate::control::{OrbitGains, OrbitHold};
 use crate::model::{CentralField, CentralFieldError, Noise, OrbitState};
-use crate::rig::Context;
+use crate::rig::contract::Context;
 use crate::rig::contract::check_name;
 use crate::rig::filter::{FilterDesign, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
 use nalgebra::Vector2;

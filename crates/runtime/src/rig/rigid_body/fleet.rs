@@ -8,7 +8,7 @@ use super::limits::Motion;
 use crate::control::{FleetLaw, InFlightCommands};
 use crate::model::{RigidBody, flow_all, uniform};
 use crate::rate::port;
-use crate::rig::Fleet;
+use crate::rig::fleet::Fleet;
 use crate::role::{Body, Bounds, Guard, Law, LawInputs, MotionCheck, Refusal};
 use crate::sample::{
     CommandLayout, FleetCommand, FleetMeasurement, FleetTruth, MeasurementLayout, Message, RateEstimate, TruthLayout,

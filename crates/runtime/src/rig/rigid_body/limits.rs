@@ -5,7 +5,7 @@
 use crate::config::Checks;
 use crate::model::RigidBody;
 use crate::rate::ALL;
-use crate::rig::Figure;
+use crate::rig::contract::Figure;
 use crate::rig::filter::SURE_DEVIATIONS;
 use crate::role::{Bounds, Guard, MotionCheck, PlausibilityCheck, Refusal};
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement, Sample, status};

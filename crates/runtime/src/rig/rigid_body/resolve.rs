@@ -11,8 +11,9 @@ use crate::config::{Checks, ConfigError, Document};
 use crate::model::{Inertia, Noise};
 use crate::observe::{AxisymmetricRelation, Filter, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter};
 use crate::rate::{Identifier, LearnerDesign};
+use crate::rig::BodyInfo;
+use crate::rig::contract::Context;
 use crate::rig::filter::{FilterDesign, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
-use crate::rig::{BodyInfo, Context};
 use nalgebra::{Matrix3, Vector1, Vector3};
 use std::sync::Arc;
 

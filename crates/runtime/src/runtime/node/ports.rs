@@ -4,7 +4,7 @@
 
 use crate::bus::{Port, Signal, Topic};
 use crate::config::{BodyInfo, Settings};
-use crate::runtime::RoleId;
+use crate::runtime::role_id::RoleId;
 use crate::sample::{Health, InputChange, Schedule};
 
 /// The signals of a role.
