@@ -5,6 +5,7 @@
 pub(crate) mod accept;
 mod body;
 mod checks;
+pub(crate) mod common;
 mod document;
 mod edit;
 mod error;

@@ -6,7 +6,15 @@ use super::checks::Checks;
 use super::error::nearest;
 use super::raw::{OnBreach, Watchdog};
 use crate::control::WatchBounds;
+use serde::Deserialize;
 use std::collections::BTreeMap;
+
+/// The bounds by key; the keys depend on the rig.
+#[derive(Deserialize)]
+pub(crate) struct Maxima {
+    #[serde(default)]
+    pub watchdog: BTreeMap<String, f64>,
+}
 
 /// Checks the bounds and resolves them to ticks.
 pub(crate) fn resolve(

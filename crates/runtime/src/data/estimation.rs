@@ -75,6 +75,33 @@ impl Request {
         };
         self.wheel.map(turned)
     }
+
+    /// Checks the axes, and allows a log to lack the sensors that do not contribute to the two rates about the other principal axes.
+    fn sensors(&self, options: &Options) -> Result<Options, EstimateError> {
+        let axes = self.axes.unwrap_or_else(Matrix3::identity);
+        let defect = (axes.transpose() * axes - Matrix3::identity()).amax();
+        if !(defect < ROTATION && axes.determinant() > 0.0) {
+            return Err(EstimateError::Axes);
+        }
+        let contributes = |sensor, axis| axis + 1 != self.axis && axes[(sensor, axis)].abs() > UNMIXED;
+        let needed = [0, 1, 2].map(|sensor| (0..3).any(|axis| contributes(sensor, axis)));
+        let absent = |sensor: &usize| options.rates.as_ref().is_some_and(|names| names[*sensor] == "-");
+        if let Some(sensor) = (0..3).filter(|sensor| needed[*sensor]).find(absent).filter(|_| self.axes.is_some()) {
+            return Err(EstimateError::Mixed { axis: ["x", "y", "z"][sensor] });
+        }
+        Ok(Options { may_lack: needed.map(|needed| !needed), ..options.clone() })
+    }
+
+    /// Returns the measured rates about the principal axes, rad/s.
+    fn principal_rates(&self, entry: &Entry) -> Vector3<f64> {
+        let measured = Vector3::from(entry.rate_rad_s);
+        let Some(axes) = &self.axes else { return measured };
+        // An unknown rate does not affect rates to which it does not contribute.
+        Vector3::from_fn(|axis, _| {
+            let parts = (0..3).map(|sensor| (axes[(sensor, axis)], measured[sensor]));
+            parts.filter(|(part, _)| part.abs() > UNMIXED).map(|(part, rate)| part * rate).sum()
+        })
+    }
 }
 
 /// An error of an estimate.
@@ -158,38 +185,14 @@ pub fn estimate_log(
     request: &Request,
     mut each: impl FnMut(&Estimated, &str) -> std::io::Result<()>,
 ) -> Result<Estimation, EstimateError> {
-    let axes = request.axes.unwrap_or_else(Matrix3::identity);
-    let defect = (axes.transpose() * axes - Matrix3::identity()).amax();
-    if !(defect < ROTATION && axes.determinant() > 0.0) {
-        return Err(EstimateError::Axes);
-    }
-    let hidden = request.axis.wrapping_sub(1);
-    // The sensors that contribute to the two rates about the other principal axes.
-    let needed = [0, 1, 2].map(|sensor| (0..3).any(|axis| axis != hidden && axes[(sensor, axis)].abs() > UNMIXED));
-    let options = Options { may_lack: needed.map(|needed| !needed), ..options.clone() };
-    let absent = |sensor: &usize| options.rates.as_ref().is_some_and(|names| names[*sensor] == "-");
-    if let Some(sensor) = (0..3).filter(|sensor| needed[*sensor]).find(absent).filter(|_| request.axes.is_some()) {
-        return Err(EstimateError::Mixed { axis: ["x", "y", "z"][sensor] });
-    }
-    let (options, forces) = resolved(path, &options)?;
+    let (options, forces) = resolved(path, &request.sensors(options)?)?;
     let mut log = Log::open(path, &options)?;
-    let principal = |entry: &Entry| {
-        let measured = Vector3::from(entry.rate_rad_s);
-        if request.axes.is_none() {
-            return measured;
-        }
-        // An unknown rate does not affect rates to which it does not contribute.
-        Vector3::from_fn(|axis, _| {
-            let parts = (0..3).map(|sensor| (axes[(sensor, axis)], measured[sensor]));
-            parts.filter(|(part, _)| part.abs() > UNMIXED).map(|(part, rate)| part * rate).sum()
-        })
-    };
-    let (head, survey) = survey(&mut log, request, principal)?;
+    let (head, survey) = survey(&mut log, request)?;
     let choice = survey.choose();
     let filter = filter(request, choice.as_ref(), path)?;
     let noise_rad_s = choice.map_or(0.0, |choice| choice.noise_rad_s);
     let floor_rad_s = request.floor_rad_s.unwrap_or((FLOOR_NOISES * noise_rad_s).max(LEAST_FLOOR_RAD_S));
-    let mut reconstruction = Reconstruction::new(&Setup {
+    let mut progress = Progress::new(Reconstruction::new(&Setup {
         coefficients: request.coefficients,
         axis: request.axis,
         damping_per_s: request.damping_per_s,
@@ -197,60 +200,81 @@ pub fn estimate_log(
         filter,
         guess_rad_s: request.guess_rad_s,
         floor_rad_s,
-    })?;
-    let (mut score, mut segments, mut name) = (Score::default(), Vec::new(), String::new());
-    let (mut fastest_rad_s, mut begun, mut diverged, mut last_s) = (0.0_f64, false, 0, 0.0);
-    // With the name of a segment that begins.
-    let mut take = |entry: &Entry, named: Option<String>| -> Result<(), EstimateError> {
-        if let Some(named) = named {
-            let ended = std::mem::replace(&mut name, named);
-            segments.extend(score.end_segment().map(|score| (ended, score)));
-            reconstruction.end_segment();
-            begun = false;
-        }
-        let principal_rad_s = principal(entry);
-        let mut reconstructed = reconstruction.push(&Sample { time_s: entry.time_s, rate_rad_s: principal_rad_s });
-        let known = principal_rad_s.iter().filter(|rate| rate.is_finite()).map(|rate| rate * rate).sum::<f64>();
-        let turn_rad = known.sqrt() * (entry.time_s - last_s);
-        // Where steps turn so far, the differences that give noise and floor are motion.
-        reconstructed.too_long |= !reconstructed.observed && !entry.begins && turn_rad > LONG_TURN_RAD;
-        last_s = entry.time_s;
-        score.push(&reconstructed, principal_rad_s[hidden]);
-        let rates = principal_rad_s.iter().filter(|rate| rate.is_finite());
-        fastest_rad_s = rates.fold(fastest_rad_s, |fastest, rate| fastest.max(rate.abs()));
-        begun |= reconstructed.observed;
-        // False for NaN.
-        let near = reconstructed.rate_rad_s.abs() <= DIVERGED * fastest_rad_s;
-        diverged += u64::from(begun && !near && !entry.begins);
-        each(&Estimated { entry: *entry, principal_rad_s, estimate: reconstructed }, &name).map_err(EstimateError::Sink)
+    })?);
+    let mut take = |entry: Entry, segment: Option<String>| {
+        segment.into_iter().for_each(|name| progress.end_segment(name));
+        let estimated = progress.push(entry, request);
+        each(&estimated, &progress.segment).map_err(EstimateError::Sink)
     };
-    for (entry, named) in head {
-        take(&entry, named)?;
-    }
+    head.into_iter().try_for_each(|(entry, segment)| take(entry, segment))?;
     while let Some(entry) = log.next().transpose()? {
-        take(&entry, entry.begins.then(|| log.segment_name()))?;
+        take(entry, entry.begins.then(|| log.segment_name()))?;
     }
-    segments.extend(score.end_segment().map(|score| (name, score)));
     let mut account = LogAccount { path: path.to_owned(), ..LogAccount::new(&log) };
     account.meaning.forces = forces;
-    Ok(Estimation {
-        log: account,
-        filter,
-        floor_rad_s,
-        choice,
-        chosen: request.decay_per_s.is_none(),
-        diverged,
-        segments,
-    })
+    progress.end_segment(String::new());
+    let Progress { diverged, segments, .. } = progress;
+    let chosen = request.decay_per_s.is_none();
+    Ok(Estimation { log: account, filter, floor_rad_s, choice, chosen, diverged, segments })
+}
+
+/// The reconstruction of a log up to a row.
+struct Progress {
+    reconstruction: Reconstruction,
+    score: Score,
+    /// The name of the present segment.
+    segment: String,
+    segments: Vec<(String, SegmentScore)>,
+    fastest_rad_s: f64,
+    /// True once the present segment was observed.
+    begun: bool,
+    diverged: u64,
+    last_s: f64,
+}
+
+impl Progress {
+    fn new(reconstruction: Reconstruction) -> Self {
+        Self {
+            reconstruction,
+            score: Score::default(),
+            segment: String::new(),
+            segments: Vec::new(),
+            fastest_rad_s: 0.0,
+            begun: false,
+            diverged: 0,
+            last_s: 0.0,
+        }
+    }
+
+    /// Ends the present segment; `next` is the name of the one that begins.
+    fn end_segment(&mut self, next: String) {
+        let ended = std::mem::replace(&mut self.segment, next);
+        self.segments.extend(self.score.end_segment().map(|score| (ended, score)));
+        self.reconstruction.end_segment();
+        self.begun = false;
+    }
+
+    fn push(&mut self, entry: Entry, request: &Request) -> Estimated {
+        let principal_rad_s = request.principal_rates(&entry);
+        let mut estimate = self.reconstruction.push(&Sample { time_s: entry.time_s, rate_rad_s: principal_rad_s });
+        let known = || principal_rad_s.iter().copied().filter(|rate| rate.is_finite());
+        let turn_rad = known().map(|rate| rate * rate).sum::<f64>().sqrt() * (entry.time_s - self.last_s);
+        // Where steps turn so far, the differences that give noise and floor are motion.
+        estimate.too_long |= !estimate.observed && !entry.begins && turn_rad > LONG_TURN_RAD;
+        self.last_s = entry.time_s;
+        self.score.push(&estimate, principal_rad_s[request.axis - 1]);
+        self.fastest_rad_s = known().fold(self.fastest_rad_s, |fastest, rate| fastest.max(rate.abs()));
+        self.begun |= estimate.observed;
+        // False for NaN.
+        let near = estimate.rate_rad_s.abs() <= DIVERGED * self.fastest_rad_s;
+        self.diverged += u64::from(self.begun && !near && !entry.begins);
+        Estimated { entry, principal_rad_s, estimate }
+    }
 }
 
 /// Reads a log's start, with the name of each segment that begins there.
 #[allow(clippy::type_complexity, reason = "it is taken apart at once")]
-fn survey(
-    log: &mut Log,
-    request: &Request,
-    principal: impl Fn(&Entry) -> Vector3<f64>,
-) -> Result<(Vec<(Entry, Option<String>)>, RateSurvey), EstimateError> {
+fn survey(log: &mut Log, request: &Request) -> Result<(Vec<(Entry, Option<String>)>, RateSurvey), EstimateError> {
     let (mut head, mut survey) = (Vec::new(), RateSurvey::new(&request.coefficients, request.axis));
     let (mut motion, wheel) =
         (Motion::with_wheel(request.wheel.map_or(Vector3::zeros(), |wheel| wheel.momentum)), request.principal_wheel());
@@ -263,7 +287,7 @@ fn survey(
             motion.end_segment();
             scale.iter_mut().for_each(ScaleSurvey::end_segment);
         }
-        let measured = principal(&entry);
+        let measured = request.principal_rates(&entry);
         if entry.rate_rad_s.iter().all(|rate| rate.is_finite()) {
             motion.push(&sample(&entry));
         } else if let Some(scale) = &mut scale {

@@ -5,7 +5,7 @@
 //! | `log` | a log, row by row, and the beginning of its segments |
 //! | `cut` | the parts of a log that are read |
 //! | `form` | options of a log, rows of a file format, errors |
-//! | `columns` | the column and the unit of each quantity |
+//! | `columns`, `names` | the column and the unit of each quantity, and what a name tells of them |
 //! | `table` | the separator, the header and the first row of a text |
 //! | `csv` | rows of a text |
 //! | `mcap` | rows of an MCAP file |
@@ -27,6 +27,7 @@ mod form;
 mod identification;
 mod log;
 mod mcap;
+mod names;
 mod packed;
 #[cfg(feature = "parquet")]
 mod parquet;
