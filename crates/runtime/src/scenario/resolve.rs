@@ -63,7 +63,7 @@ impl Scenario {
         let (mut tables, of_rig) = Tables::read(&mut document)?;
         let mut checks = Checks::new(&document);
         common::check(&tables.raw, &mut checks);
-        let times = Times::of(&tables.raw);
+        let times = Times::new(&tables.raw);
         let context = tables.context(times);
         let (rig, rig_table) = match registry::resolve(&tables.raw.rig, &of_rig, context, &mut checks) {
             Ok(resolved) => resolved,
@@ -140,7 +140,7 @@ struct Times {
 }
 
 impl Times {
-    fn of(raw: &Raw) -> Self {
+    fn new(raw: &Raw) -> Self {
         let period_ns = (1e9 / raw.tick_hz).round() as u64;
         let (rate_possible, length_possible) = (tick_possible(raw.tick_hz), length_possible(raw));
         Self {
@@ -179,10 +179,7 @@ impl Tables {
                 let hosts = Hosts { hosts: raw.host.clone(), network: raw.network.clone() };
                 Ok((Self { raw, rates, hosts, metrics: metrics.accept, bounds: maxima.watchdog }, of_rig))
             }
-            (raw, metrics, rates) => {
-                let others = [metrics.err(), rates.err()];
-                Err(unreadable(document, &of_rig, raw.err(), others))
-            }
+            (raw, metrics, rates) => Err(unreadable(document, &of_rig, raw.err(), [metrics.err(), rates.err()])),
         }
     }
 
@@ -237,7 +234,7 @@ fn unreadable(
     document: &Document,
     of_rig: &Document,
     raw: Option<ConfigError>,
-    others: [Option<ConfigError>; 2],
+    further: [Option<ConfigError>; 2],
 ) -> ConfigError {
     let mut checks = Checks::new(document);
     let context = Context::every_tick(1.0 / MAX_TICK_HZ);
@@ -246,7 +243,7 @@ fn unreadable(
     let nested = nested_keys(document.text("rig"), rig);
     checks.retain(|key| key == "rig");
     let rig_errors = checks.finish::<()>(None).err();
-    let errors = raw.map(|error| error.within(&nested)).into_iter().chain(others.into_iter().flatten());
+    let errors = raw.map(|error| error.within(&nested)).into_iter().chain(further.into_iter().flatten());
     let mut errors = errors.chain(own.and_then(Result::err)).chain(rig_errors);
     let first = errors.next().expect("at least one error");
     first.and(errors)

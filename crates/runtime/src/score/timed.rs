@@ -1,6 +1,6 @@
 //! A rig's view of samples as words that follows the inputs of a run, for readers of whole runs.
 
-use super::take_input;
+use super::scoring::take_input;
 use crate::config::Settings;
 use crate::rig::{Rig, WordView};
 use crate::runtime::RoleInputs;
