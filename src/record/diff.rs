@@ -4,7 +4,8 @@
 //! times and generations differ between any two runs.
 
 use super::error::RecordError;
-use super::reader::{Recording, Track};
+use super::reader::Recording;
+use super::track::Track;
 use crate::sample::{FieldKind, Stamp};
 
 /// The largest difference at which two numbers count as equal: the sum of both tolerances.

@@ -12,7 +12,8 @@ pub(crate) use parquet::{Cell, ColumnKind, RowGroups};
 
 use self::table::Table;
 use super::error::RecordError;
-use super::reader::{Recording, SignalInfo};
+use super::reader::Recording;
+use super::track::SignalInfo;
 use crate::files;
 use crate::sample::Stamp;
 use crate::system::remedy;

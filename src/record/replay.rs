@@ -4,8 +4,9 @@
 //! the time of sending and the generation, which are not outputs of the role.
 
 use super::error::RecordError;
-use super::reader::{Recording, Track};
+use super::reader::Recording;
 use super::script::{Limit, Script, Step};
+use super::track::Track;
 use crate::bus::memory::MemoryBus;
 use crate::bus::{AnyBus, BusError, Reader, WordReader, WordWriter};
 use crate::runtime::{NodeError, Poll, ReadyNode, RoleId, RunCondition, depths, ports, private_ledger};

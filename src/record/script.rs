@@ -7,7 +7,8 @@
 //! claimed ([`Limit`]). Must not run a role.
 
 use super::error::RecordError;
-use super::reader::{Recording, SignalInfo, Track};
+use super::reader::Recording;
+use super::track::{SignalInfo, Track};
 use crate::bus::Port;
 use crate::clock::Grid;
 use crate::config::{ClockKind, ScriptedFault};

@@ -2,7 +2,8 @@
 
 use super::table::{Table, columns};
 use crate::files::Created;
-use crate::record::reader::{Recording, SignalInfo};
+use crate::record::reader::Recording;
+use crate::record::track::SignalInfo;
 use crate::sample::FieldKind;
 use std::io::{self, BufWriter, Write};
 

@@ -4,7 +4,8 @@
 
 use super::table::{Table, columns};
 use crate::files::Created;
-use crate::record::reader::{Recording, SignalInfo};
+use crate::record::reader::Recording;
+use crate::record::track::SignalInfo;
 use crate::sample::FieldKind;
 use parquet::basic::{Compression, LogicalType, Repetition, Type as Physical, ZstdLevel};
 use parquet::data_type::{BoolType, ByteArray, ByteArrayType, DoubleType, Int64Type};

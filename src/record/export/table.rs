@@ -1,7 +1,8 @@
 //! A table of a recording, in any format.
 
 use crate::files::Created;
-use crate::record::reader::{Recording, SignalInfo};
+use crate::record::reader::Recording;
+use crate::record::track::SignalInfo;
 use crate::sample::{FieldKind, Layout};
 use std::io;
 
