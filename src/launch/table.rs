@@ -299,12 +299,15 @@ fn counters(summary: &Summary, all: bool, text: &mut String) {
     let executed: u64 = books.roles.values().map(|ticks| ticks.executed).sum();
     let _ = writeln!(
         text,
-        "\ncounters {}: {} roles, {executed} ticks, {} missed or starved, {} of {} scored",
+        "\ncounters {}: {} roles, {executed} ticks, {} missed or starved, {}",
         if books.balanced { "balance" } else { "DO NOT BALANCE" },
         books.roles.len(),
         books.missed_ticks,
-        summary.score.scored_ticks,
-        summary.score.scored_ticks + summary.score.unscored_ticks,
+        match (summary.score.scored_ticks, summary.score.unscored_ticks) {
+            (0, _) => "none scored".to_owned(),
+            (_, 0) => "all scored".to_owned(),
+            (_, unscored) => format!("{unscored} not scored"),
+        },
     );
     let late = books.roles.iter().filter_map(|(role, ticks)| Some((role, ticks.late.filter(|late| *late > 0)?)));
     let late: Vec<(&String, u64)> = late.collect();
