@@ -2,7 +2,7 @@
 
 use super::output::{CommandResult, Exit, Failure, fail, harmless, remark, say};
 use super::runs;
-use crate::config::{Document, Variability};
+use crate::config::{ConfigError, Document, Variability};
 use crate::files;
 use crate::inputs::{Answer, InputError, WantedChange, change, current};
 use crate::scenario::Scenario;
@@ -68,6 +68,9 @@ Examples:
   corotate get                     all inputs of the newest run
   corotate get controller.gain_per_s --json";
 
+/// The remedy for a word that changes nothing.
+const ASSIGN: &str = "write KEY=VALUE, as in `corotate set controller.gain_per_s=[6,6,6]`";
+
 fn seconds(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(seconds) if (0.0..=1e9).contains(&seconds) => Ok(seconds),
@@ -81,8 +84,7 @@ pub fn set(arguments: &SetArguments) -> CommandResult {
     let changes = assignments.iter().map(|word| wanted(word, arguments.ramp)).collect::<Result<Vec<_>, _>>();
     let changes = changes.map_err(|failure| fail(Exit::Usage, failure))?;
     if changes.is_empty() && arguments.save.is_none() {
-        let text = "name an input and its value, as in `corotate set controller.gain_per_s=[6,6,6]`";
-        return Err(fail(Exit::Usage, Failure::new("no-change", text)));
+        return Err(fail(Exit::Usage, Failure::new("no-change", format!("there is no input to change; {ASSIGN}"))));
     }
     let root = runs::domain(run.map(Path::new))?;
     if changes.is_empty() {
@@ -244,9 +246,14 @@ fn split(words: &[String], is_rest: impl Fn(&str) -> bool) -> (Option<&str>, &[S
 fn wanted(word: &str, ramp_s: f64) -> Result<WantedChange, Failure> {
     let mut document = Document::parse("", "set")?;
     let key = word.split('=').next().unwrap_or_default().trim().replace('[', ".").replace(']', "");
-    document.set(word)?;
+    document.set(word).map_err(|error| match error {
+        ConfigError::Override { argument, source } => {
+            Failure::new((&source).into(), format!("{argument}: {source}; {ASSIGN}"))
+        }
+        error => error.into(),
+    })?;
     let value = document.get(&key).cloned();
-    let value = value.ok_or_else(|| Failure::new("no-value", format!("{word}: there is no value; write key=value")))?;
+    let value = value.ok_or_else(|| Failure::new("no-value", format!("{word}: there is no value; {ASSIGN}")))?;
     Ok(WantedChange { key, value, ramp_s })
 }
 
