@@ -17,7 +17,9 @@ const HIDDEN: usize = 2;
 const DECAY_RATE_PER_S: f64 = 6.0;
 const GUESS_RAD_S: f64 = 0.0;
 const FLOOR_RAD_S: f64 = 1e-6;
-const GAIN_PER_S: [f64; 3] = [4.0; 3];
+const GAIN_PER_S: f64 = 4.0;
+/// The largest gain times period: the sampled loop is unstable from 1 on.
+const GAIN_PER_TICK_MAX: f64 = 0.8;
 /// The limit printed by `corotate check rigid-pair`.
 const ACCELERATION_MAX_RAD_S2: f64 = 115.333_456_311_831_88;
 
@@ -36,7 +38,7 @@ pub fn observer() -> Option<HiddenObserver> {
 
 /// Returns the law of the follower for the period `tick_s`.
 pub fn law(tick_s: f64) -> Option<RateLaw> {
-    let (inertia, gain) = (inertia()?, Vector3::from(GAIN_PER_S));
+    let (inertia, gain) = (inertia()?, Vector3::from([GAIN_PER_S.min(GAIN_PER_TICK_MAX / tick_s); 3]));
     let bound = inertia.rate_bound_rad_s(&LEADER_RATE_RAD_S.into());
     let certificate = Certificate::new(&inertia.coefficients(), HIDDEN + 1, &gain, DECAY_RATE_PER_S, bound, tick_s, 1);
     Some(RateLaw::new(&RateLawDesign {
