@@ -7,11 +7,12 @@ use super::settings::NotExternal;
 use crate::control::ACTUATION_DELAY_MAX;
 
 /// The slowest tick rate: a period must lie well within the range of a latency histogram.
-pub(crate) const MIN_TICK_HZ: f64 = 0.1;
+const MIN_TICK_HZ: f64 = 0.1;
 /// The fastest tick rate: beyond it, reading the clock alone fills the period.
 pub(crate) const MAX_TICK_HZ: f64 = 1e5;
 /// The largest number of ticks of a run: ten years at 1 kHz.
-pub(crate) const MAX_TICKS: f64 = 3.2e11;
+const MAX_TICKS: f64 = 3.2e11;
+
 /// Returns true if the tick rate is within the limits.
 pub(crate) fn tick_possible(tick_hz: f64) -> bool {
     (MIN_TICK_HZ..=MAX_TICK_HZ).contains(&tick_hz)
